@@ -1,0 +1,1 @@
+"""Tracked head -> avatar -> numbers. Steps (verbs) open files; libraries (nouns) are pure. May import `fitting`, `workflow`."""

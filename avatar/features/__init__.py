@@ -1,0 +1,1 @@
+"""Sources of the per-vertex features: one module each, chosen by name in `avatar.build`."""

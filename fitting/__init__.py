@@ -1,0 +1,1 @@
+"""Video -> tracked head. Steps (verbs) open files; libraries (nouns) are pure. May import `workflow`, never `avatar`."""
