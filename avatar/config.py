@@ -17,9 +17,29 @@ from fitting.config import StepConfig
 class TrainConfig(StepConfig):
     """train: fit the avatar to the training frames."""
 
-    representation: Literal["ours_d"] = Field("ours_d", description="Source of the vertex features; a module of `avatar/features/`.")
+    representation: Literal["ours_d"] = Field(
+        "ours_d", description="Source of the vertex features; a module of `avatar/features/`."
+    )
     steps: int = Field(2000, ge=1, description="Optimisation steps; every schedule point scales with it.")
     seed: int = Field(0, description="Seed of every random number in training.")
+    rays: int = Field(1024, ge=1, le=65536, description="Rays a step, over all its frames.")
+    frames_per_step: int = Field(4, ge=1, le=64, description="Frames from which a step draws its rays.")
+    learning_rate: float = Field(1e-3, gt=0, le=0.1, description="Adam's rate at the start; it decays to a tenth.")
+    feature_channels: int = Field(64, ge=4, le=256, description="Values per vertex that the U-Net predicts.")
+    uv_size: int = Field(64, ge=64, le=512, multiple_of=64, description="Side of the UV maps in texels.")
+    static_features: bool = Field(False, description="Add a learned constant to each vertex's predicted features.")
+    mlp_width: int = Field(128, ge=16, le=512, description="Width of the MLPs before and after the sum over neighbours.")
+    mlp_depth: int = Field(3, ge=1, le=8, description="Layers of each of these two MLPs.")
+    colour_width: int = Field(64, ge=8, le=256, description="Width of the colour MLP.")
+    neighbours: int = Field(4, ge=1, le=16, description="Vertices that a point reads.")
+    bands: int = Field(10, ge=0, le=12, description="Octaves of the positional encoding of offsets to vertices.")
+    view_bands: int = Field(4, ge=0, le=8, description="Octaves of the encoding of view directions.")
+    sample_step_m: float = Field(
+        0.002, gt=0, le=0.05, description="Length of shell in metres that one sample of a ray stands for."
+    )
+    max_samples: int = Field(
+        16, ge=1, le=512, description="Samples on a ray at most; a longer way through the shell takes longer steps."
+    )
 
 
 class RenderConfig(StepConfig):
@@ -28,8 +48,24 @@ class RenderConfig(StepConfig):
     max_frames: int | None = Field(None, ge=1, description="At most this many test frames, evenly spaced; null renders all.")
 
 
+class BaselineConfig(StepConfig):
+    """baseline: a trivial predictor that stands beside every avatar."""
+
+    predictor: Literal["mean_frame", "nearest_frame"] = Field(
+        "mean_frame", description="The mean training frame, or the training frame nearest in expression and pose."
+    )
+    max_frames: int | None = Field(None, ge=1, description="At most this many test frames, evenly spaced; null takes all.")
+
+
 class EvaluateConfig(StepConfig):
     """evaluate: PSNR, SSIM and LPIPS of every rendered frame."""
+
+
+class TabulateConfig(StepConfig):
+    """tabulate: the table of every subject and variant. The rule fills this in; it is no part of `config.yaml`."""
+
+    subjects: tuple[str, ...] = Field((), description="Subjects that must have a row; those without files are rows as well.")
+    variants: tuple[str, ...] = Field((), description="Variants that must have a column, in order; others found follow.")
 
 
 class PlotConfig(StepConfig):
@@ -37,7 +73,7 @@ class PlotConfig(StepConfig):
 
 
 class PageConfig(StepConfig):
-    """page: one HTML page a subject and variant."""
+    """page: one HTML page a subject."""
 
 
 class VariantConfig(StepConfig):
@@ -55,7 +91,9 @@ class Settings(BaseModel):
 
     videos: str = Field("videos", description="Folder of videos, one subject each; the file's stem is the subject's name.")
     device: str = Field("auto", description="Where training and rendering run: `cpu`, `cuda`, `cuda:N`, or `auto`.")
-    assets: dict[str, str] = Field(default_factory=dict, description="Your own copies of assets by name (see `fitting.fetch`); the rest is fetched.")
+    assets: dict[str, str] = Field(
+        default_factory=dict, description="Your own copies of assets by name (see `fitting.fetch`); the rest is fetched."
+    )
     head: fitting.HeadConfig = fitting.HeadConfig()
     probe: fitting.ProbeConfig = fitting.ProbeConfig()
     extract: fitting.ExtractConfig = fitting.ExtractConfig()

@@ -68,7 +68,10 @@ class HeadModel:
     def save(self, path: Path | str) -> None:
         """Write the model as a plain `.npz`."""
         arrays = {item.name: getattr(self, item.name) for item in fields(self)}
-        np.savez_compressed(path, **{name: value.cpu().numpy() if isinstance(value, Tensor) else np.array(value) for name, value in arrays.items()})
+        np.savez_compressed(
+            path,
+            **{name: value.cpu().numpy() if isinstance(value, Tensor) else np.array(value) for name, value in arrays.items()},
+        )
 
     @property
     def vertex_count(self) -> int:
@@ -89,7 +92,9 @@ class HeadModel:
         """Rest joints [5, 3] m of one identity, shape [S]."""
         return self.joints + torch.einsum("s,sjd->jd", shape, self.joint_shape_basis)
 
-    def local(self, shape: Tensor, expression: Tensor, jaw: Tensor, eyes: Tensor | None = None, neck: Tensor | None = None) -> Tensor:
+    def local(
+        self, shape: Tensor, expression: Tensor, jaw: Tensor, eyes: Tensor | None = None, neck: Tensor | None = None
+    ) -> Tensor:
         """Posed vertices in the neck-normalised head frame (design note 3): `M^-1 V`.
 
         Args:
@@ -137,7 +142,9 @@ class HeadModel:
         turned = torch.einsum("tij,tj->ti", root, offset - rest[0]) + rest[0]
         return root @ bent, turned + translation
 
-    def forward(self, shape: Tensor, expression: Tensor, rotation: Tensor, neck: Tensor, jaw: Tensor, eyes: Tensor, translation: Tensor) -> Tensor:
+    def forward(
+        self, shape: Tensor, expression: Tensor, rotation: Tensor, neck: Tensor, jaw: Tensor, eyes: Tensor, translation: Tensor
+    ) -> Tensor:
         """Posed vertices [T, V, 3] m in camera axes; arguments as in `local` and `rigid`."""
         matrix, offset = self.rigid(shape, rotation, neck, translation)
         return torch.einsum("tij,tvj->tvi", matrix, self.local(shape, expression, jaw, eyes, neck)) + offset[:, None]

@@ -197,8 +197,17 @@ def main(run: Callable[[Job], None], config_type: type, argv: list[str] | None =
         for path in vars(temporary).values():
             path.parent.mkdir(parents=True, exist_ok=True)
             _remove(path)
-        job = Job(config, _pairs(arguments.input), temporary, final, arguments.subject, arguments.threads,
-                  resolve_device(arguments.device), arguments.code, log)
+        job = Job(
+            config,
+            _pairs(arguments.input),
+            temporary,
+            final,
+            arguments.subject,
+            arguments.threads,
+            resolve_device(arguments.device),
+            arguments.code,
+            log,
+        )
         run(job)
         for key, path in vars(temporary).items():
             if not path.exists():

@@ -1,0 +1,116 @@
+"""A small z-buffer: which triangle each pixel sees, in numba on the CPU.
+
+Used wherever pixels ask for geometry without gradients: visibility, overlays, trimming, grey renders for the landmark embedding
+and for simulated clips.  The slow twin in the tests casts one ray a pixel at every triangle.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+EMPTY = -1
+
+
+@njit(cache=True, fastmath=False)
+def _fill(points, triangles, height, width, depth, index, bary):
+    for f in range(triangles.shape[0]):
+        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        xa, ya, za = points[a, 0], points[a, 1], points[a, 2]
+        xb, yb, zb = points[b, 0], points[b, 1], points[b, 2]
+        xc, yc, zc = points[c, 0], points[c, 1], points[c, 2]
+        if za <= 1e-6 or zb <= 1e-6 or zc <= 1e-6:
+            continue
+        area = (xb - xa) * (yc - ya) - (yb - ya) * (xc - xa)
+        if area == 0.0 or not np.isfinite(area):
+            continue
+        left = max(0, int(np.floor(min(xa, xb, xc) - 0.5)))
+        right = min(width - 1, int(np.ceil(max(xa, xb, xc) - 0.5)))
+        top = max(0, int(np.floor(min(ya, yb, yc) - 0.5)))
+        bottom = min(height - 1, int(np.ceil(max(ya, yb, yc) - 0.5)))
+        for y in range(top, bottom + 1):
+            py = y + 0.5
+            for x in range(left, right + 1):
+                px = x + 0.5
+                u = ((xb - px) * (yc - py) - (yb - py) * (xc - px)) / area
+                v = ((xc - px) * (ya - py) - (yc - py) * (xa - px)) / area
+                w = 1.0 - u - v
+                if u < 0.0 or v < 0.0 or w < 0.0:
+                    continue
+                inverse = u / za + v / zb + w / zc  # 1/z is linear on the screen
+                z = 1.0 / inverse
+                if z < depth[y, x]:
+                    depth[y, x] = z
+                    index[y, x] = f
+                    bary[y, x, 0] = u / za * z
+                    bary[y, x, 1] = v / zb * z
+                    bary[y, x, 2] = w / zc * z
+
+
+def rasterise(points: np.ndarray, triangles: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nearest triangle of every pixel, both faces of a triangle drawn, perspective-correct.
+
+    Args:
+        points: [V, 3] x and y in pixels (pixel centres at +0.5), z > 0 in metres along the optical axis.
+        triangles: [F, 3] int.
+        size: (H, W).
+
+    Returns:
+        index [H, W] int32, EMPTY where nothing is seen; depth [H, W] float32 m, inf where empty; barycentric [H, W, 3] float32.
+        Triangles with a corner at or behind the camera are left out.
+    """
+    height, width = size
+    depth = np.full((height, width), np.inf, np.float32)
+    index = np.full((height, width), EMPTY, np.int32)
+    bary = np.zeros((height, width, 3), np.float32)
+    _fill(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(triangles, np.int64), height, width, depth, index, bary)
+    return index, depth, bary
+
+
+def project(vertices: np.ndarray, focal_px: float, centre_px: np.ndarray) -> np.ndarray:
+    """Pinhole projection of camera-space points [..., 3] m to (x px, y px, z m)."""
+    depth = vertices[..., 2:]
+    return np.concatenate([focal_px * vertices[..., :2] / depth + np.asarray(centre_px), depth], -1)
+
+
+def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Area-weighted unit normals [V, 3] of one mesh [V, 3]; zero where a vertex has no area around it."""
+    corners = vertices[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(total, triangles[:, k], normal)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return total / np.where(length > 0, length, 1)
+
+
+def shade(
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    focal_px: float,
+    centre_px: np.ndarray,
+    size: tuple[int, int],
+    colour: np.ndarray,
+    background: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Head-lit Lambert picture of one camera-space mesh.
+
+    Args:
+        vertices: [V, 3] m; colour: [V, 3] or [3] in [0, 1].
+
+    Returns:
+        image [H, W, 3] float32 in [0, 1] and index [H, W] as `rasterise` gives it.
+    """
+    index, _, bary = rasterise(project(vertices, focal_px, centre_px), triangles, size)
+    seen = index >= 0
+    corner = triangles[index[seen]]
+    weight = bary[seen][..., None]
+    normal = (vertex_normals(vertices, triangles)[corner] * weight).sum(1)
+    point = (vertices[corner] * weight).sum(1)
+    towards = -point / np.linalg.norm(point, axis=1, keepdims=True)
+    length = np.linalg.norm(normal, axis=1)
+    light = 0.25 + 0.75 * np.abs((normal * towards).sum(1)) / np.where(length > 0, length, 1)
+    paint = np.broadcast_to(colour, vertices.shape)[corner]
+    image = np.full((*size, 3), background, np.float32)
+    image[seen] = (paint * weight).sum(1) * light[:, None]
+    return image, index
