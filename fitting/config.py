@@ -52,10 +52,31 @@ class DetectConfig(StepConfig):
 class SplitConfig(StepConfig):
     """split: training frames first, a contiguous test tail last."""
 
+    train_fraction: float = Field(0.75, gt=0, lt=1, description="Part of the frames, from the start, that trains.")
+    max_train_frames: int = Field(1500, ge=1, description="Upper bound of the training frames.")
+    test_frames: int | None = Field(
+        None, ge=1, description="Exactly this many last frames test; null: all after the training part."
+    )
+
 
 class FitConfig(StepConfig):
     """fit: camera and head parameters of every frame."""
 
+    keyframes: int = Field(
+        40, ge=5, le=200, description="Training frames on which focal length, shape and landmark bias are solved together."
+    )
+    reinit_every: int = Field(
+        200, ge=10, description="Frames between re-initialisations (pose by PnP, expression neutral), as in the paper."
+    )
+    iterations: int = Field(6, ge=1, le=100, description="Gauss-Newton iterations a frame at most.")
+    focal_px: float | None = Field(
+        None, gt=0, description="Focal length in pixels of the source video where it is known; null estimates it from the clip."
+    )
+
 
 class TrimConfig(StepConfig):
     """trim: the matte without clothes below the neck."""
+
+    neck_margin_m: float = Field(
+        0.02, ge=0, le=0.1, description="How far (m) beside the mesh's neck skin is kept below the chin."
+    )
