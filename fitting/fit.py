@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 
-from fitting import camera, energy, stages
+from fitting import bundle, camera, energy, stages
 from fitting.config import FitConfig
 from fitting.head_model import HeadModel
 from fitting.landmark_model import LandmarkModel
@@ -34,6 +34,10 @@ WEIGHTS = energy.Weights(
     log_focal_sd=0.3,
     shape_sd=1.0,
 )
+SMOOTHNESS = bundle.Smoothness(
+    rotation_rad=np.radians(0.4), across_m=0.0005, depth_m=0.001, expression=0.15, gaze_rad=np.radians(4)
+)
+SWEEPS = 5
 BIAS_SD_M = 0.0015  # what the embedding's own views disagree by
 PRIOR_FROM_SCORES = (
     1.0  # centring the expression prior on the blendshape scores: shape within 2 sd instead of 4, same held-out error
@@ -130,7 +134,7 @@ def _sharpness(frames: np.ndarray, observed: stages.Observed, rows: np.ndarray) 
 def _track(
     job: step.Job, model: LandmarkModel, observed: stages.Observed, split: dict, shared: energy.State
 ) -> tuple[energy.State, np.ndarray]:
-    """All frames in blocks that start afresh; no block crosses from training to test frames."""
+    """All frames in blocks that start afresh, then a bundle that closes the seams; nothing crosses the split."""
     count = len(observed.found)
     reinit = np.zeros(count, bool)
     poses = stages.neutral(model, count, shared.log_focal)
@@ -146,6 +150,13 @@ def _track(
         block = stages.track_block(model, observed, rows, WEIGHTS, shared, job.config.iterations)
         for name in ("rotation", "translation", "expression", "gaze"):
             getattr(poses, name)[rows] = getattr(block, name)
+    for part in ("train", "test"):  # no temporal term crosses the split
+        rows = np.array(split[part], int)
+        if not len(rows):
+            continue
+        bundled = bundle.smooth(model, observed, rows, WEIGHTS, poses.frame(rows), SMOOTHNESS, SWEEPS)
+        for name in ("rotation", "translation", "expression", "gaze"):
+            getattr(poses, name)[rows] = getattr(bundled, name)
     return poses, reinit
 
 

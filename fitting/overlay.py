@@ -22,8 +22,10 @@ def draw_mesh(
         [H, W, 3] uint8.
     """
     picture, index = raster.shade(vertices, triangles, focal_px, centre_px, frame.shape[:2], MESH_COLOUR)
-    seen = (index >= 0)[..., None]
-    return np.where(seen, (1 - opacity) * frame + opacity * 255 * picture, frame).astype(np.uint8)
+    seen = index >= 0
+    out = frame.copy()
+    out[seen] = (1 - opacity) * frame[seen] + opacity * 255 * picture[seen]
+    return out
 
 
 def draw_points(frame: np.ndarray, points: np.ndarray) -> np.ndarray:

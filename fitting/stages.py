@@ -28,7 +28,7 @@ class Observed:
 
     def frames(self, rows: np.ndarray, keep: np.ndarray | None = None) -> Frames:
         """Observations of some frames; keep [L] bool hides landmarks."""
-        weight = self.inside[rows].astype(np.float64)
+        weight = self.inside[rows] * self.found[rows, None].astype(np.float64)
         weight = weight if keep is None else weight * keep
         return Frames(self.points[rows], weight, self.scale_px[rows], self.centre_px, self.expression_mean[rows])
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fitting import camera, stages
+from fitting import bundle, camera, stages
+from fitting.fit import SMOOTHNESS
 from fitting.landmark_model import LandmarkModel
 from tests.landmarked import WEIGHTS, detected, landmarked_head, random_state
 
@@ -104,6 +105,37 @@ def test_ten_percent_outliers_of_50_px(model, made):
     dirty = stages.track_block(model, replace(observed, points=points), np.arange(20), WEIGHTS, shared, 6)
     error = lambda s: np.median(rotation_error_deg(s.rotation, truth.rotation[:20]))  # noqa: E731
     assert error(dirty) < max(2 * error(clean), 1.0)
+
+
+def test_smoothing_brings_jittered_frames_nearer_to_the_truth_and_closes_seams(model):
+    truth = random_state(model, 60)
+    observed = detected(model, truth, 4.0)
+    shared = truth.frame(slice(0, 1))
+    blocks = [stages.track_block(model, observed, np.arange(k, k + 20), WEIGHTS, shared, 6) for k in (0, 20, 40)]
+    names = ("rotation", "translation", "expression", "gaze")
+    rough = replace(blocks[0], **{n: np.concatenate([getattr(b, n) for b in blocks]) for n in names})
+    rows = np.arange(60)
+    calm = bundle.smooth(model, observed, rows, WEIGHTS, rough, SMOOTHNESS, 5)
+    before, after = (rotation_error_deg(s.rotation, truth.rotation)[2:-2] for s in (rough, calm))
+    assert np.mean(after) < 0.8 * np.mean(before)
+    assert np.percentile(after, 95) < np.percentile(before, 95)
+    depth = lambda s: np.abs(s.translation[2:-2, 2] - truth.translation[2:-2, 2]).mean()  # noqa: E731
+    assert depth(calm) < depth(rough)
+
+
+def test_smoothing_carries_lost_frames_and_leaves_short_clips_alone(model, made):
+    truth, observed = made
+    found = np.ones(60, bool)
+    found[20:23] = False
+    points = np.where(found[:, None, None], observed.points, 0.0)
+    state = stages.track_block(
+        model, replace(observed, points=points, found=found), np.arange(60), WEIGHTS, truth.frame(slice(0, 1)), 6
+    )
+    calm = bundle.smooth(model, replace(observed, points=points, found=found), np.arange(60), WEIGHTS, state, SMOOTHNESS, 30)
+    held, carried = (rotation_error_deg(s.rotation, truth.rotation)[20:23].mean() for s in (state, calm))
+    assert carried < 0.6 * held
+    short = state.frame(slice(0, 4))
+    assert bundle.smooth(model, observed, np.arange(4), WEIGHTS, short, SMOOTHNESS, 2) is short
 
 
 def test_no_face_in_a_block_is_an_error(model, made):
