@@ -1,0 +1,170 @@
+# The only place with Python: config checked, videos found, and the helpers that the rules share.
+# Parsed again by every cluster job: nothing here imports torch, and nothing prints.
+import atexit
+import json
+import shlex
+import sys
+from functools import cache
+from pathlib import Path
+
+from avatar.config import RenderConfig, Settings, TrainConfig
+from fitting.assets import ASSETS
+from workflow import settings as checks
+from workflow.digest import code_digest
+from workflow.settings import PREDICTORS
+from workflow.summary import summary
+
+CONFIG = "config/config.yaml or --config"
+try:
+    SETTINGS = checks.validated(Settings, config, CONFIG)
+    VARIANTS = checks.resolve_variants(
+        SETTINGS.variants,
+        Path(workflow.basedir) / "config" / "presets",
+        {"train": TrainConfig, "render": RenderConfig},
+        CONFIG,
+    )
+    checks.check_names(SETTINGS.assets, ASSETS, "assets", CONFIG)
+    VIDEOS = checks.discover(Path(SETTINGS.videos))
+except checks.SettingsError as mistake:
+    raise SystemExit(str(mistake)) from None
+
+SUBJECTS = list(VIDEOS)
+ALL_VARIANTS = [*VARIANTS, *PREDICTORS]
+# Once a run: an edit while it runs counts in the next one.
+digest_of = cache(code_digest)
+PYTHON = shlex.quote(sys.executable)
+
+
+wildcard_constraints:
+    subject="|".join(map(re.escape, SUBJECTS)),
+    variant="|".join(map(re.escape, ALL_VARIANTS)),
+    predictor="|".join(PREDICTORS),
+    asset="|".join(map(re.escape, ASSETS)),
+
+
+def named(paths):
+    """NAME=PATH for the command line; a name that holds several paths is repeated."""
+    pairs = [(name, [found] if isinstance(found, str) else found) for name, found in paths.items()]
+    return " ".join(shlex.quote(f"{name}={path}") for name, found in pairs for path in found)
+
+
+def step(name, subject=None, device=False):
+    """How a rule calls a step, but for its config and code, which are parameters of their own.
+
+    A function of input and output, so that none of this counts as a parameter: where the work runs, and on how many threads,
+    changes no result.
+    """
+
+    def call(wildcards, input, output, threads):
+        who = subject or wildcards.get("subject") or wildcards.asset
+        where = f" --device {shlex.quote(SETTINGS.device)}" if device else ""
+        files = f"--input {named(input)} --output {named(output)}"
+        return f"{PYTHON} -m {name} --subject {shlex.quote(who)} --threads {threads}{where} {files}"
+
+    return call
+
+
+def config_of(step):
+    """Resolved config of a step, defaults included, as one JSON parameter."""
+    text = getattr(SETTINGS, step).model_dump_json()
+    return lambda wildcards: text
+
+
+def variant_config(step):
+    """As `config_of`, for the steps that a preset configures."""
+    return lambda wildcards: VARIANTS[wildcards.variant][step].model_dump_json()
+
+
+def predictor_config(wildcards):
+    """A predictor takes the frames that the first variant renders."""
+    max_frames = next(iter(VARIANTS.values()))["render"].max_frames
+    return json.dumps({"predictor": wildcards.predictor, "max_frames": max_frames})
+
+
+def table_config(wildcards):
+    """Rows and columns that a table must have, whatever became of them."""
+    return json.dumps({"subjects": SUBJECTS, "variants": ALL_VARIANTS})
+
+
+def code_of(command):
+    """Digest of the code that a step imports."""
+    return lambda wildcards: digest_of(command)
+
+
+def model_code_of(command):
+    """As `code_of`, with the module of the variant's representation, which is imported by name."""
+
+    def code(wildcards):
+        representation = VARIANTS[wildcards.variant]["train"].representation
+        return digest_of(command, (f"avatar.features.{representation}",))
+
+    return code
+
+
+def asset(name):
+    """Path of a fetched file. Its content is fixed by its sha256 (see `sha_of`), so its time says nothing."""
+    return ancient(f"resources/assets/{name}")
+
+
+def sha_of(name):
+    """What an asset must hash to: another model is another parameter."""
+    return ASSETS[name].sha256
+
+
+def video_of(wildcards):
+    """The subject's video."""
+    return str(VIDEOS[wildcards.subject])
+
+
+def content_of_video(wildcards):
+    """Fingerprint of the video: touching or copying it changes nothing, another video does."""
+    return checks.fingerprint(VIDEOS[wildcards.subject])
+
+
+def accepted(subject):
+    """Whether probe found one face in most frames; asking makes the plan wait for probe."""
+    path = checkpoints.probe.get(subject=subject).output.probe
+    return json.loads(Path(path).read_text(encoding="utf-8"))["accepted"]
+
+
+def page_of(subject):
+    """What is wanted of a subject: its page, and of a rejected one the reason alone.
+
+    One input function per subject: one that fails in probe holds back no other.
+    """
+    return lambda wildcards: f"results/{subject}/page" if accepted(subject) else f"results/{subject}/probe/probe.json"
+
+
+def training_of(wildcards):
+    """Report of the training behind a render; a predictor has none."""
+    pattern = "results/{subject}/{variant}/train.json"
+    return expand(pattern, **wildcards) if wildcards.variant in VARIANTS else []
+
+
+def of_accepted(pattern):
+    """The pattern's file of every accepted subject and every variant."""
+
+    def paths(wildcards):
+        return expand(pattern, subject=filter(accepted, SUBJECTS), variant=ALL_VARIANTS)
+
+    return paths
+
+
+def of_subject(pattern, variants):
+    """The pattern's file of every variant of one subject."""
+    return expand(pattern, variant=variants, allow_missing=True)
+
+
+def tabulate_existing(wildcards, threads):
+    """As `step`, for a table of what exists now."""
+    probes = [path for path in expand("results/{subject}/probe/probe.json", subject=SUBJECTS) if Path(path).exists()]
+    pattern = "results/{subject}/{variant}/metrics/metrics.json"
+    metrics = [path for path in expand(pattern, subject=SUBJECTS, variant=ALL_VARIANTS) if Path(path).exists()]
+    input = {"probes": probes, "metrics": metrics}
+    output = {"csv": "results/tables/available.csv", "markdown": "results/tables/available.md"}
+    return step("avatar.tabulate", subject="all")({}, input, output, threads)
+
+
+def summarise_at_exit():
+    """Have the last lines of a run say what came of every subject."""
+    atexit.register(lambda: print("", *summary(SUBJECTS, VARIANTS), sep="\n", file=sys.stderr))
