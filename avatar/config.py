@@ -23,8 +23,9 @@ class TrainConfig(StepConfig):
     steps: int = Field(2000, ge=1, description="Optimisation steps; every schedule point scales with it.")
     seed: int = Field(0, description="Seed of every random number in training.")
     rays: int = Field(1024, ge=1, le=65536, description="Rays a step, over all its frames.")
-    frames_per_step: int = Field(4, ge=1, le=64, description="Frames from which a step draws its rays.")
+    frames_per_step: int = Field(2, ge=1, le=64, description="Frames from which a step draws its rays.")
     learning_rate: float = Field(1e-3, gt=0, le=0.1, description="Adam's rate at the start; it decays to a tenth.")
+    opacity_weight: float = Field(0.1, ge=0, le=10, description="Weight of opacity's squared error against the matte.")
     feature_channels: int = Field(64, ge=4, le=256, description="Values per vertex that the U-Net predicts.")
     uv_size: int = Field(64, ge=64, le=512, multiple_of=64, description="Side of the UV maps in texels.")
     static_features: bool = Field(False, description="Add a learned constant to each vertex's predicted features.")
@@ -38,7 +39,7 @@ class TrainConfig(StepConfig):
         0.002, gt=0, le=0.05, description="Length of shell in metres that one sample of a ray stands for."
     )
     max_samples: int = Field(
-        16, ge=1, le=512, description="Samples on a ray at most; a longer way through the shell takes longer steps."
+        12, ge=1, le=512, description="Samples on a ray at most; a longer way through the shell takes longer steps."
     )
 
 

@@ -1,0 +1,93 @@
+"""render: the test frames of an avatar, composited on white, and a video beside the input."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from avatar import build
+from avatar.config import RenderConfig
+from avatar.dataset import Scene, on_white
+from avatar.frames import chosen_frames
+from avatar.layers import best_precision
+from fitting.head_model import HeadModel
+from fitting.video import write_video
+from workflow import step
+
+
+def load(job: step.Job) -> tuple[torch.nn.Module, Scene, list[int]]:
+    """The avatar, the posed scene and the frames to render; StepError names what does not fit together."""
+    try:
+        head = HeadModel.load(job.input.head)
+        avatar = build.restore(torch.load(job.input.avatar, map_location=job.device, weights_only=True), head)
+    except (ValueError, RuntimeError, KeyError) as error:
+        raise step.StepError(f"{job.input.avatar}: {error}; train the avatar again") from error
+    frames = chosen_frames(step.read_json(job.input.split)["test"], job.config.max_frames)
+    if not frames:
+        raise step.StepError(f"{job.input.split}: there is no test frame; use a longer clip")
+    with np.load(job.input.track, allow_pickle=False) as file:
+        track = {name: file[name] for name in file.files}
+    try:
+        return avatar.to(job.device), Scene(head, track, frames), frames
+    except ValueError as error:
+        raise step.StepError(f"{job.input.track}: {error}; fit the clip again") from error
+
+
+def render_frame(
+    avatar: torch.nn.Module, scene: Scene, frame: int, size: tuple[int, int], precision: torch.dtype, device: str
+) -> tuple[np.ndarray, int]:
+    """One image [H, W, 4] uint8 (RGB on white, A opacity) and the number of field evaluations."""
+    place = scene.place[frame]
+    posed = avatar.pose(scene.vertices_m[place : place + 1].to(device), scene.displacement_m[place : place + 1].to(device))
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    rendered, evaluations = avatar.march(posed, scene.rays(frame, columns.ravel(), rows.ravel()), precision)
+    image = torch.cat([rendered.colour, rendered.opacity[:, None]], 1).clamp(0, 1)
+    if not torch.isfinite(image).all():
+        raise step.StepError(f"the render of frame {frame} is not finite; train the avatar again")
+    return (image * 255 + 0.5).byte().numpy().reshape(*size, 4), evaluations
+
+
+def side_by_side(frames: np.ndarray, alpha: np.ndarray, rendered: np.ndarray, chosen: list[int]) -> Iterator[np.ndarray]:
+    """Input on white beside its render, [H, 2 W, 3] uint8 each."""
+    for place, frame in enumerate(chosen):
+        yield np.concatenate([(on_white(frames[frame], alpha[frame]) * 255 + 0.5).astype(np.uint8), rendered[place, ..., :3]], 1)
+
+
+def run(job: step.Job) -> None:
+    """Inputs head avatar frames index track alpha split; outputs render report video."""
+    avatar, scene, chosen = load(job)
+    frames, alpha = np.load(job.input.frames, mmap_mode="r"), np.load(job.input.alpha, mmap_mode="r")
+    size, precision = frames.shape[1:3], best_precision(job.device)
+    rendered = np.empty((len(chosen), *size, 4), np.uint8)
+    milliseconds, evaluations = [], 0
+    render_frame(avatar, scene, chosen[0], (8, 8), precision, job.device)  # compile and allocate before the clock runs
+    for place, frame in enumerate(job.progress(chosen, "rendering")):
+        started = time.perf_counter()
+        rendered[place], count = render_frame(avatar, scene, frame, size, precision, job.device)
+        milliseconds.append(1000 * (time.perf_counter() - started))
+        evaluations += count
+    with open(job.output.render, "wb") as file:
+        np.save(file, rendered)
+    covered = int((rendered[..., 3] > 0).sum())
+    job.write_json(
+        job.output.report,
+        {
+            "frames": chosen,
+            "ms_per_frame": round(float(np.median(milliseconds)), 1),
+            "size": list(size),
+            "precision": str(precision).split(".")[1],
+            "evaluations_per_frame": evaluations // len(chosen),
+            "evaluations_per_ray": round(evaluations / (len(chosen) * size[0] * size[1]), 3),
+            "evaluations_per_covered_ray": round(evaluations / max(covered, 1), 3),
+        },
+    )
+    fps = float(step.read_json(job.input.index)["fps"])
+    shown = fps * len(chosen) / max(len(step.read_json(job.input.split)["test"]), 1)  # frames left out must not speed it up
+    write_video(job.output.video, side_by_side(frames, alpha, rendered, chosen), max(shown, 1.0))
+
+
+if __name__ == "__main__":
+    step.main(run, RenderConfig)

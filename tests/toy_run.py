@@ -1,0 +1,65 @@
+"""A toy subject on disk, and the steps train and render run on it in this process."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from toy_head import toy_head, toy_images, toy_track
+
+from avatar import train
+from avatar.config import TrainConfig
+from workflow.step import Job
+
+SMALL = {
+    "rays": 192,
+    "frames_per_step": 1,
+    "mlp_width": 64,
+    "colour_width": 32,
+    "feature_channels": 16,
+    "bands": 6,
+    "max_samples": 8,
+    "sample_step_m": 0.004,
+    "learning_rate": 3e-3,
+    "static_features": True,
+}
+
+
+def write_subject(folder: Path, frames: int = 8, size: int = 40) -> dict[str, Path]:
+    """Frames, mattes, track, split and head model of a toy subject; the last two frames are the test."""
+    head = toy_head(24, 36)
+    track = toy_track(head, frames, size)
+    images, alpha = toy_images(head, track, size)
+    paths = {
+        "head": folder / "head.npz",
+        "frames": folder / "frames.npy",
+        "alpha": folder / "alpha.npy",
+        "track": folder / "track.npz",
+        "split": folder / "split.json",
+        "index": folder / "frames.json",
+    }
+    head.save(paths["head"])
+    np.save(paths["frames"], images)
+    np.save(paths["alpha"], alpha)
+    np.savez(paths["track"], **track)
+    paths["split"].write_text(json.dumps({"train": list(range(frames - 2)), "test": [frames - 2, frames - 1]}))
+    paths["index"].write_text(json.dumps({"fps": 25}))
+    return paths
+
+
+def job(config: object, inputs: dict[str, Path], outputs: dict[str, Path], code: str = "c") -> Job:
+    """A job as the harness makes it, but with outputs written in place."""
+    for path in outputs.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    names = SimpleNamespace(**outputs)
+    return Job(config, SimpleNamespace(**inputs), names, names, "toy", 1, "cpu", code, logging.getLogger("toy"))
+
+
+def train_in(folder: Path, inputs: dict[str, Path], code: str = "c", **keys: object) -> dict[str, Path]:
+    """Train into a folder; returns the outputs."""
+    outputs = {"avatar": folder / "avatar.pt", "curve": folder / "curve.tsv", "report": folder / "train.json"}
+    train.run(job(TrainConfig(**(SMALL | keys)), inputs, outputs, code))
+    return outputs
