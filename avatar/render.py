@@ -25,6 +25,7 @@ def load(job: step.Job) -> tuple[torch.nn.Module, Scene, list[int]]:
         avatar = build.restore(torch.load(job.input.avatar, map_location=job.device, weights_only=True), head)
     except (ValueError, RuntimeError, KeyError) as error:
         raise step.StepError(f"{job.input.avatar}: {error}; train the avatar again") from error
+    avatar.step_m, avatar.max_samples = avatar.step_m / job.config.sample_factor, round(avatar.max_samples * job.config.sample_factor)
     frames = chosen_frames(step.read_json(job.input.split)["test"], job.config.max_frames)
     if not frames:
         raise step.StepError(f"{job.input.split}: there is no test frame; use a longer clip")
