@@ -1,4 +1,4 @@
-# make demo: everything on the demo clip; make test: linters and all tests. Both need Python 3.11 and make, nothing else.
+# make demo: everything on the demo clip; make test: linters and all tests. Both need Python 3.11, gcc and make.
 PYTHON ?= python3.11
 BIN := .venv/bin
 DEMO := build/demo/videos

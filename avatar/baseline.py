@@ -12,22 +12,20 @@ import time
 
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 
 from avatar.config import BaselineConfig
 from avatar.frames import chosen_frames
+from fitting.camera import project
+from fitting.files import load_head
 from fitting.head_model import HeadModel
 from fitting.video import write_video
 from workflow import step
 
 CHUNK_FRAMES = 16
-STILL = 0.01
-"""A coefficient that spreads less than this share of the most moving one is noise and is left out of the distance."""
-EXPRESSION_WEIGHT = 0.25
-"""Pose moves every pixel, expression few: with equal weights the predictor is 0.9 dB weaker on nerface.mp4, a lower bar."""
-DISTANCE = (
-    f"squared distance = {EXPRESSION_WEIGHT} (standardised expression and jaw)^2 + (angle between head rotations)^2 + (distance "
-    "between head centres)^2, each term divided by its mean over pairs of training frames"
-)
+VERTICES = 500
+"""About this many vertices of the head model are compared."""
+DISTANCE = "rms distance in pixels between the projected vertices of the two fitted heads"
 
 
 def mean_frame(frames: np.ndarray, alpha: np.ndarray, train: list[int]) -> np.ndarray:
@@ -60,48 +58,34 @@ def on_white(frame: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return np.concatenate([colour, alpha[..., None]], -1)
 
 
-def nearest_frames(
-    expression: np.ndarray, rotation: np.ndarray, centre: np.ndarray, train: list[int], test: list[int]
-) -> tuple[list[int], np.ndarray]:
-    """For each test frame the training frame nearest in expression and pose; `DISTANCE` says how.
+def nearest_frames(pixels: np.ndarray, train: list[int], test: list[int]) -> tuple[list[int], np.ndarray]:
+    """For each test frame the training frame nearest in expression and pose.
+
+    In the picture expression, gaze and pose have one unit, pixels: no weights, hence nothing to tune.
 
     Args:
-        expression: [T, E] expression and jaw coefficients.
-        rotation: [T, 3, 3] head to camera.
-        centre: [T, 3] m, head's origin in camera axes.
+        pixels: [T, V, 2] projected vertices of the fitted head.
         train, test: frame indices; one training frame at least.
 
     Returns:
-        a training frame for each test frame, and the distances [T_test].
+        a training frame for each test frame, and the rms distances [T_test] px.
     """
-    spread = expression[train].std(0)
-    moving = spread > STILL * spread.max()
-    codes = expression[:, moving] / spread[moving] if moving.any() else np.zeros((len(expression), 1))
-
-    def squared(first: list[int], second: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The three squared distances, each [first, second]."""
-        apart = ((codes[first, None] - codes[None, second]) ** 2).mean(-1)
-        cosine = (np.einsum("aij,bij->ab", rotation[first], rotation[second]) - 1) / 2
-        moved = ((centre[first, None] - centre[None, second]) ** 2).sum(-1)
-        return apart, np.arccos(np.clip(cosine, -1, 1)) ** 2, moved
-
-    few = train[:: max(1, len(train) // 200)]  # spreads from at most 400 frames: 1500^2 pairs of 52 codes are 1 GB
-    scales = [max(float(values.mean()), 1e-12) for values in squared(few, few)]
-    chosen, distances = [], []
-    for frame in test:
-        apart, angle, moved = (values[0] / scale for values, scale in zip(squared([frame], train), scales, strict=True))
-        total = EXPRESSION_WEIGHT * apart + angle + moved
-        best = int(total.argmin())
-        chosen.append(train[best])
-        distances.append(float(np.sqrt(total[best])))
-    return chosen, np.array(distances)
+    flat = pixels.reshape(len(pixels), -1)
+    distance = cdist(flat[test], flat[train])
+    best = distance.argmin(1)
+    return [train[index] for index in best], distance.min(1) / np.sqrt(pixels.shape[1])
 
 
-def _pose(head: HeadModel, track: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Head rotation [T, 3, 3] and centre [T, 3] m of every frame: root and neck in one."""
-    values = [torch.from_numpy(track[name]).double() for name in ("shape", "rotation", "neck", "translation")]
-    rotation, centre = head.rigid(*values)
-    return rotation.numpy(), centre.numpy()
+def _pixels(head: HeadModel, track: dict[str, np.ndarray]) -> np.ndarray:
+    """Projected vertices [T, about VERTICES, 2] px of every frame of a track."""
+    names = ("expression", "rotation", "neck", "jaw", "eyes", "translation")
+    shape = torch.from_numpy(track["shape"])
+    some = slice(None, None, max(1, head.vertex_count // VERTICES))
+    found = []
+    for start in range(0, len(track["expression"]), CHUNK_FRAMES):
+        values = (torch.from_numpy(track[name][start : start + CHUNK_FRAMES]) for name in names)
+        found.append(head.forward(shape, *values)[:, some].numpy().astype(np.float64))
+    return project(np.concatenate(found), float(track["focal_px"]), track["centre_px"])
 
 
 def _predict(job: step.Job, frames: np.ndarray, alpha: np.ndarray, train: list[int], test: list[int]) -> tuple[np.ndarray, dict]:
@@ -115,11 +99,9 @@ def _predict(job: step.Job, frames: np.ndarray, alpha: np.ndarray, train: list[i
     else:
         with np.load(job.input.track, allow_pickle=False) as file:
             track = {name: file[name] for name in file.files}
-        rotation, centre = _pose(HeadModel.load(job.input.head, torch.float64), track)
-        codes = np.concatenate([track["expression"], track["jaw"]], -1).astype(np.float64)
-        chosen, distances = nearest_frames(codes, rotation, centre, train, test)
+        chosen, distances = nearest_frames(_pixels(load_head(job.input.head), track), train, test)
         render = np.stack([on_white(frames[index], alpha[index]) for index in chosen])
-        facts = {"training_frames": len(train), "how": DISTANCE, "nearest": chosen, "distance": distances.round(4).tolist()}
+        facts = {"training_frames": len(train), "how": DISTANCE, "nearest": chosen, "distance_px": distances.round(3).tolist()}
     return render, facts | {"ms_per_frame": 1e3 * (time.perf_counter() - started) / len(test)}
 
 
@@ -139,8 +121,8 @@ def run(job: step.Job) -> None:
         np.save(file, render)
     inputs = (on_white(frames[frame], alpha[frame]) for frame in test)
     pairs = (np.concatenate(pair, 1)[..., :3] for pair in zip(inputs, render, strict=True))
-    stride = max(1, round(len(split["test"]) / len(test)))
-    write_video(job.output.video, pairs, max(1.0, float(index["fps"]) / stride))
+    shown = float(index["fps"]) * len(test) / len(split["test"])  # frames left out must not speed it up
+    write_video(job.output.video, pairs, max(1.0, shown))
     job.write_json(job.output.report, {"predictor": True, "name": job.config.predictor, "frames": test} | facts)
     job.log.info("%s: %d test frames from %d training frames", job.config.predictor, len(test), len(train))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import io
 import json
 import os
 import pickle
@@ -73,18 +74,25 @@ def fingerprint(job: step.Job) -> str:
     return digest.hexdigest()
 
 
+def write(path: Path, content: dict) -> None:
+    """`torch.save` by way of memory: on a full disk the file's own write raises OSError, which the harness has a sentence for."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    path.write_bytes(buffer.getbuffer())
+
+
 def save(path: Path, mark: str, state: State, avatar: nn.Module, optimiser: torch.optim.Optimizer) -> None:
     """Replace the checkpoint in one rename."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".partial")
-    torch.save(
+    write(
+        temporary,
         {
             "fingerprint": mark,
             "state": vars(state) | {"recent": list(state.recent)},
             "avatar": avatar.state_dict(),
             "optimiser": optimiser.state_dict(),
         },
-        temporary,
     )
     os.replace(temporary, path)
 

@@ -22,6 +22,7 @@ from avatar.volume import Rays, Rendered, composite
 RAY_CHUNK = 16384
 SLOT_BLOCK = 4
 FIELD_CHUNK = 4096
+CLOSED = 20.0  # optical depth where a ray ends at the core: the head is opaque, white never shines through it
 END = 0.004  # light behind a ray's end: one level of 8 bits
 VOID = 0.01  # optical depth across a voxel below which its surroundings are skipped
 
@@ -86,8 +87,9 @@ class RadianceAvatar(nn.Module):
         device = terms.device
         parts, offset = [], 0
         for head, bundle in enumerate(rays):
-            found, count = shell.intervals(posed.grids[head], bundle.origins_m, bundle.directions)
-            samples = shell.sample(found, count, self.step_m, self.max_samples, None if jitter is None else jitter[head])
+            found, count, met = shell.intervals(posed.grids[head], bundle.origins_m, bundle.directions)
+            offsets = None if jitter is None else jitter[head]
+            samples = shell.sample(found, count, self.step_m, self.max_samples, offsets, met)
             points = bundle.origins_m[samples.ray] + samples.distance_m[:, None] * bundle.directions[samples.ray]
             index = self._nearest(posed, head, points) + head * posed.vertices_m.shape[1]
             parts.append(
@@ -98,15 +100,16 @@ class RadianceAvatar(nn.Module):
                     samples.step_m,
                     samples.ray + offset,
                     samples.slot,
+                    samples.closed,
                     index,
                 )
             )
             offset += len(bundle.origins_m)
-        points, directions, distance, step, ray, slot, index = (
+        points, directions, distance, step, ray, slot, closed, index = (
             torch.from_numpy(np.concatenate(column)).to(device) for column in zip(*parts, strict=True)
         )
         density, colour = self.field(points, directions, posed.vertices_m.flatten(0, 1), index, terms, precision)
-        rendered, _ = composite(density * step, colour, distance, ray, slot, offset)
+        rendered, _ = composite(density * step + CLOSED * closed, colour, distance, ray, slot, offset)
         return rendered, len(points)
 
     def _nearest(self, posed: Posed, head: int, points: np.ndarray) -> np.ndarray:
@@ -131,8 +134,8 @@ class RadianceAvatar(nn.Module):
         grid, evaluations = self._pruned(posed, terms, precision)
         for start in range(0, count_rays, RAY_CHUNK):
             chunk = Rays(rays.origins_m[start : start + RAY_CHUNK], rays.directions[start : start + RAY_CHUNK])
-            found, count = shell.intervals(grid, chunk.origins_m, chunk.directions)
-            samples = shell.sample(found, count, self.step_m, self.max_samples, None)
+            found, count, met = shell.intervals(grid, chunk.origins_m, chunk.directions)
+            samples = shell.sample(found, count, self.step_m, self.max_samples, None, met)
             light, shade, middle = (
                 np.ones(len(count), np.float32),
                 np.zeros((len(count), 3), np.float32),
@@ -156,7 +159,8 @@ class RadianceAvatar(nn.Module):
                 )
                 present, place = np.unique(ray, return_inverse=True)
                 part, weight = composite(
-                    density * torch.from_numpy(samples.step_m[chosen]).to(device),
+                    density * torch.from_numpy(samples.step_m[chosen]).to(device)
+                    + CLOSED * torch.from_numpy(samples.closed[chosen]).to(device),
                     tint,
                     torch.from_numpy(distance).to(device),
                     torch.from_numpy(place).to(device),

@@ -13,19 +13,20 @@ from avatar.config import RenderConfig
 from avatar.dataset import Scene, on_white
 from avatar.frames import chosen_frames
 from avatar.layers import best_precision
-from fitting.head_model import HeadModel
+from fitting.files import load_head
 from fitting.video import write_video
 from workflow import step
 
 
 def load(job: step.Job) -> tuple[torch.nn.Module, Scene, list[int]]:
     """The avatar, the posed scene and the frames to render; StepError names what does not fit together."""
+    head = load_head(job.input.head)
     try:
-        head = HeadModel.load(job.input.head)
         avatar = build.restore(torch.load(job.input.avatar, map_location=job.device, weights_only=True), head)
     except (ValueError, RuntimeError, KeyError) as error:
         raise step.StepError(f"{job.input.avatar}: {error}; train the avatar again") from error
-    avatar.step_m, avatar.max_samples = avatar.step_m / job.config.sample_factor, round(avatar.max_samples * job.config.sample_factor)
+    factor = job.config.sample_factor
+    avatar.step_m, avatar.max_samples = avatar.step_m / factor, round(avatar.max_samples * factor)
     frames = chosen_frames(step.read_json(job.input.split)["test"], job.config.max_frames)
     if not frames:
         raise step.StepError(f"{job.input.split}: there is no test frame; use a longer clip")

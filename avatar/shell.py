@@ -35,6 +35,7 @@ class Samples(NamedTuple):
     step_m: np.ndarray  # [P] float32 length of shell that the sample stands for
     ray: np.ndarray  # [P] int64
     slot: np.ndarray  # [P] int64 rank on its ray
+    closed: np.ndarray  # [P] bool: the last sample of a ray that ends at the core; no light passes it
 
 
 def core_points(vertices_m: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -104,15 +105,17 @@ def _mark(labels, points, radii, voxel):  # noqa: ANN001, ANN202
 
 def intervals(
     grid: Grid, origins_m: np.ndarray, directions: np.ndarray, max_length_m: float = np.inf
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stretches of each ray inside the shell, front to back, until it meets the core.
 
     origins_m, directions: [N, 3], unit directions.
     max_length_m: stop after this much shell.
-    Returns start and end [N, MAX_INTERVALS, 2] float64 m along the ray and count [N] int64.
+    Returns start and end [N, MAX_INTERVALS, 2] float64 m along the ray, count [N] int64, and whether the ray ended
+    at the core [N] bool.
     """
     found = np.zeros((len(origins_m), MAX_INTERVALS, 2))
     count = np.zeros(len(origins_m), np.int64)
+    met = np.zeros(len(origins_m), bool)
     _march(
         grid.labels,
         VOXEL_M,
@@ -121,12 +124,13 @@ def intervals(
         max_length_m,
         found,
         count,
+        met,
     )
-    return found, count
+    return found, count, met
 
 
 @numba.njit(cache=True)
-def _march(labels, voxel, origins, directions, max_length, found, count):  # noqa: ANN001, ANN202
+def _march(labels, voxel, origins, directions, max_length, found, count, met):  # noqa: ANN001, ANN202
     """Amanatides-Woo traversal; neighbouring shell voxels join into one interval."""
     shape = labels.shape
     cell = np.empty(3, np.int64)
@@ -170,6 +174,7 @@ def _march(labels, voxel, origins, directions, max_length, found, count):  # noq
                 axis = 2
             after = min(max(next_t[axis], t), leave)
             if label == CORE:
+                met[n] = True
                 break
             if label == SHELL and after > t:
                 if not inside:
@@ -192,11 +197,19 @@ def _march(labels, voxel, origins, directions, max_length, found, count):  # noq
         count[n] = number
 
 
-def sample(found: np.ndarray, count: np.ndarray, step_m: float, max_samples: int, jitter: np.ndarray | None) -> Samples:
+def sample(
+    found: np.ndarray,
+    count: np.ndarray,
+    step_m: float,
+    max_samples: int,
+    jitter: np.ndarray | None,
+    met: np.ndarray | None = None,
+) -> Samples:
     """Stratified samples over the length inside the intervals of each ray.
 
     found, count: from `intervals`; step_m: wanted length for one sample; max_samples: a ray's longest list, its step grows.
     jitter: [N, max_samples] in [0, 1) places each sample in its stratum; None takes the middles.
+    met: [N] bool from `intervals`: rays whose last sample is closed; None closes none.
     """
     length = (found[..., 1] - found[..., 0]).sum(1)
     number = np.where(count > 0, np.clip(np.ceil(length / step_m), 1, max_samples), 0).astype(np.int64)
@@ -204,7 +217,8 @@ def sample(found: np.ndarray, count: np.ndarray, step_m: float, max_samples: int
     distance, step = np.empty(total, np.float32), np.empty(total, np.float32)
     ray, slot = np.empty(total, np.int64), np.empty(total, np.int64)
     _place(found, count, length, number, np.empty((0, 0), np.float32) if jitter is None else jitter, distance, step, ray, slot)
-    return Samples(distance, step, ray, slot)
+    closed = np.zeros(total, bool) if met is None else met[ray] & (slot == number[ray] - 1)
+    return Samples(distance, step, ray, slot, closed)
 
 
 @numba.njit(cache=True)

@@ -17,6 +17,7 @@ from avatar.checkpoint import BAD_WINDOW, State
 from avatar.config import TrainConfig
 from avatar.dataset import Cells, Scene, cells_of, draw, on_white, shrink_any
 from avatar.layers import best_precision
+from fitting.files import load_head
 from fitting.head_model import HeadModel
 from workflow import step
 
@@ -42,8 +43,8 @@ class Data:
 
 def load(job: step.Job) -> Data:
     """Read the inputs; StepError names what does not fit together."""
+    head = load_head(job.input.head)
     try:
-        head = HeadModel.load(job.input.head)
         with np.load(job.input.track, allow_pickle=False) as file:
             track = {name: file[name] for name in file.files}
     except (ValueError, OSError, KeyError) as error:
@@ -117,7 +118,7 @@ class Batches:
         posed = self.posed(frames, device)
         rays, jitter, truth = [], [], []
         for frame in frames:
-            columns, rows = draw(self.cells[frame], self.config.rays // count, self.data.alpha.shape[1:], random)
+            columns, rows = draw(self.cells[frame], max(1, self.config.rays // count), self.data.alpha.shape[1:], random)
             rays.append(self.data.scene.rays(frame, columns, rows))
             alpha = self.data.alpha[frame][rows, columns]
             truth.append(
@@ -208,7 +209,7 @@ def run(job: step.Job) -> None:
     path, mark = job.final.avatar.parent / "checkpoints" / "last.pt", checkpoint.fingerprint(job)
     state = checkpoint.resume(job, path, mark, avatar, optimiser)
     loop(job, Batches(job.config, data, avatar), optimiser, state, path, mark)
-    torch.save(build.content(avatar, build.settings_of(job.config), data.head), job.output.avatar)
+    checkpoint.write(job.output.avatar, build.content(avatar, build.settings_of(job.config), data.head))
     lines = ["step\tseconds\tloss\tprobe_psnr", *("\t".join(f"{value:.6g}" for value in row) for row in state.curve)]
     job.output.curve.write_text("\n".join(lines) + "\n", encoding="utf-8")
     job.write_json(

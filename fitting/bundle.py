@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -14,13 +14,17 @@ from fitting.stages import Observed
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Standard deviations of the second difference from frame to frame (at 30 frames a second)."""
+    """Standard deviations of the second difference from frame to frame, at 30 frames a second."""
 
     rotation_rad: float
     across_m: float
     depth_m: float
     expression: float
     gaze_rad: float
+
+    def at_rate(self, fps: float) -> Smoothness:
+        """The same accelerations a second at another frame rate: a second difference grows with the square of its interval."""
+        return Smoothness(*(value * (30 / fps) ** 2 for value in astuple(self)))
 
 
 def smooth(

@@ -23,7 +23,7 @@ GAZE = 4
 
 @dataclass(frozen=True)
 class Weights:
-    """Standard deviations of the terms; the values in `fitting.config.FitConfig` with units."""
+    """Standard deviations of the terms; the values stand in `fitting.fit`."""
 
     landmark_sigma: float  # of the inter-ocular distance
     robust_sigmas: float  # Huber's threshold

@@ -16,6 +16,7 @@ import torch
 
 from fitting import bundle, camera, energy, stages
 from fitting.config import FitConfig
+from fitting.files import load_head
 from fitting.head_model import HeadModel
 from fitting.landmark_model import LandmarkModel
 from fitting.overlay import overlay
@@ -49,7 +50,7 @@ LOST_OF_MEDIAN, LOST_OF_EYES = 4.0, 0.05  # a frame this much worse than the med
 
 def run(job: step.Job) -> None:
     """Fit one subject."""
-    head = HeadModel.load(job.input.head)
+    head = load_head(job.input.head)
     model = LandmarkModel.of(head)
     index, split = step.read_json(job.input.index), step.read_json(job.input.split)
     observed, log_focal = _observe(job, head, model, index)
@@ -76,13 +77,17 @@ def run(job: step.Job) -> None:
         np.abs(calibration.state.shape).max(),
     )
     started = time.perf_counter()
-    state, reinit = _track(job, model, observed, split, calibration.state)
+    state, reinit = _track(job, model, observed, split, calibration.state, float(index["fps"]))
     times["track"] = time.perf_counter() - started
     rows = np.arange(len(observed.found))
     error = stages.reprojection_px(model, observed, rows, state)
     relative = error / observed.scale_px
-    median = np.median(relative[observed.found])
+    median = np.median(relative[good])  # of training frames: the test tail decides nothing
     usable = observed.found & ~((relative > LOST_OF_MEDIAN * median) & (relative > LOST_OF_EYES))
+    for part in ("train", "test"):
+        if not usable[split[part]].any():
+            count = len(split[part])
+            raise step.StepError(f"{job.input.landmarks}: the face is lost in all {count} {part} frames; use another clip")
     state = _hold(state, usable)
     started = time.perf_counter()
     checked = np.setdiff1d(rows[usable], keyframes)[:: max(1, usable.sum() // 60)]
@@ -132,7 +137,7 @@ def _sharpness(frames: np.ndarray, observed: stages.Observed, rows: np.ndarray) 
 
 
 def _track(
-    job: step.Job, model: LandmarkModel, observed: stages.Observed, split: dict, shared: energy.State
+    job: step.Job, model: LandmarkModel, observed: stages.Observed, split: dict, shared: energy.State, fps: float
 ) -> tuple[energy.State, np.ndarray]:
     """All frames in blocks that start afresh, then a bundle that closes the seams; nothing crosses the split."""
     count = len(observed.found)
@@ -150,11 +155,14 @@ def _track(
         block = stages.track_block(model, observed, rows, WEIGHTS, shared, job.config.iterations)
         for name in ("rotation", "translation", "expression", "gaze"):
             getattr(poses, name)[rows] = getattr(block, name)
+    smoothness = SMOOTHNESS.at_rate(fps)
     for part in ("train", "test"):  # no temporal term crosses the split
         rows = np.array(split[part], int)
-        if not len(rows):
+        seen = rows[observed.found[rows]]
+        if not len(seen):
             continue
-        bundled = bundle.smooth(model, observed, rows, WEIGHTS, poses.frame(rows), SMOOTHNESS, SWEEPS)
+        nearest = seen[np.abs(rows[:, None] - seen).argmin(1)]  # a block without any face must not pull at its neighbours
+        bundled = bundle.smooth(model, observed, rows, WEIGHTS, poses.frame(nearest), smoothness, SWEEPS)
         for name in ("rotation", "translation", "expression", "gaze"):
             getattr(poses, name)[rows] = getattr(bundled, name)
     return poses, reinit
@@ -255,7 +263,7 @@ def _report(
         unknown.append(
             f"the head turns over {np.ptp(yaw):.0f} degrees only: ears, back of the head and views from the side are guesses"
         )
-    if calibration.focal_kept_prior:
+    if calibration.focal_kept_prior and not focal_known:
         unknown.append("the focal length, hence the distance and the depth of the head")
     unknown.append("the skull under the hair: landmarks end at the hairline, it follows the shape prior")
     return {

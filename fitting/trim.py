@@ -1,6 +1,6 @@
 """Step: the matte without clothes: head, hair and neck only, cut with the fitted mesh.
 
-    python -m fitting.trim --input head=resources/heads/anny.npz frames=... alpha=results/ann/matte/alpha.npy track=... \\
+    python -m fitting.trim --input head=resources/heads/anny.npz alpha=results/ann/matte/alpha.npy track=... \\
         --output alpha=results/ann/trim/alpha.npy report=results/ann/trim/trim.json
 
 What is kept, along the head's own down axis: everything of the person above the mouth (hair is as wide as it likes), and below it
@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from fitting import raster
 from fitting.config import TrimConfig
+from fitting.files import load_head
 from fitting.head_model import REGIONS, HeadModel
 from fitting.stack import StackWriter
 from workflow import step
@@ -27,7 +28,7 @@ MOUTH_ABOVE_CHIN_M = 0.035  # beside the neck the cut lies at mouth level: raise
 
 def run(job: step.Job) -> None:
     """Trim every frame of one subject."""
-    head = HeadModel.load(job.input.head)
+    head = load_head(job.input.head)
     alpha = np.load(job.input.alpha, mmap_mode="r")
     with np.load(job.input.track, allow_pickle=False) as file:
         track = {name: file[name] for name in file.files}

@@ -105,6 +105,8 @@ def make(folder: Path) -> dict[str, Path]:
         jaw=zeros,
         eyes=np.zeros((FRAMES, 2, 3), np.float32),
         translation=translation.astype(np.float32),
+        focal_px=np.float32(FOCAL_PX),
+        centre_px=np.array([WIDTH / 2, HEIGHT / 2], np.float32),
         usable=usable,
     )
     paths["lpips"].write_bytes(pickle.dumps(random_lpips(), 4))

@@ -47,27 +47,28 @@ def test_nearest_frame_finds_the_like_pose(tmp_path: Path) -> None:
     assert report["frames"] == chosen_frames(made.TEST, 5) and len(render) == 5
     for frame, nearest, image in zip(report["frames"], report["nearest"], render, strict=True):
         assert nearest in made.TRAIN
-        centre, mouth = made.pose(frame)
-        places = np.array([made.pose(other) for other in made.TRAIN])
-        spread = places.std(0)
-        apart = (places - [centre, mouth]) ** 2 / (2 * spread**2)  # mean over pairs is twice the variance
-        twin = apart[:, 0] + baseline.EXPRESSION_WEIGHT * apart[:, 1]
-        assert nearest == made.TRAIN[int(twin.argmin())]
+        centre, _ = made.pose(frame)
+        centres = np.array([[made.pose(other)[0], made.pose(other)[1]] for other in made.TRAIN])
+        assert abs(centres[made.TRAIN.index(nearest)][0] - centre) <= 2 * np.abs(centres[:, 0] - centre).min() + 1.0
         colour, alpha = made.picture(nearest)
         mask = alpha[..., None] / 255
         assert np.abs(image[..., :3] - (colour * mask + 255 * (1 - mask))).max() <= 0.51
         assert (image[..., 3] == alpha).all()
 
 
-def test_rotation_counts_and_noise_does_not() -> None:
-    turns = np.array([0.0, 0.5, 0.1])
-    rotation = np.stack([[[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]] for a in turns])
-    expression = np.array([[0, 1e-4], [1, 0], [0.0, 9e-4]])
-    chosen, distance = baseline.nearest_frames(expression, rotation, np.zeros((3, 3)), [0, 1], [2])
-    assert chosen == [0] and 0 < distance[0] < 1
-    # Nothing but rotation differs: no division by a spread of zero.
-    chosen, distance = baseline.nearest_frames(np.zeros((3, 2)), rotation, np.zeros((3, 3)), [1, 0], [2])
-    assert chosen == [0] and np.isfinite(distance).all()
+def test_nearest_equals_a_loop_over_all_pairs() -> None:
+    pixels = np.random.default_rng(0).normal(size=(12, 7, 2))
+    train, test = [0, 2, 3, 5, 7, 11], [1, 4, 6]
+    chosen, distance = baseline.nearest_frames(pixels, train, test)
+    for place, frame in enumerate(test):
+        rms = [np.sqrt(((pixels[frame] - pixels[other]) ** 2).sum(-1).mean()) for other in train]
+        assert chosen[place] == train[int(np.argmin(rms))]
+        assert distance[place] == pytest.approx(min(rms))
+
+
+def test_a_still_clip_has_no_division_by_zero() -> None:
+    chosen, distance = baseline.nearest_frames(np.zeros((3, 4, 2)), [1, 0], [2])
+    assert chosen == [1] and distance.tolist() == [0.0]
 
 
 def test_no_usable_training_frame_is_one_sentence(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -36,7 +36,7 @@ def test_intervals_equal_dense_sampling(head: tuple[np.ndarray, np.ndarray]) -> 
     vertices, thickness = head
     grid = shell.occupancy(vertices, thickness, NONE)
     origins, directions = rays_at(24)
-    found, count = shell.intervals(grid, origins, directions)
+    found, count, met = shell.intervals(grid, origins, directions)
     assert (count == 0).any() and (count >= 2).any()
     along = (np.arange(2000) + 0.5) * 0.5e-3 + 0.2
     for n in range(len(origins)):
@@ -56,10 +56,14 @@ def test_a_ray_ends_at_the_core_and_the_core_is_deep_inside(head: tuple[np.ndarr
     assert ((core / (0.075, 0.105, 0.09)) ** 2).sum(1).max() < 1
     grid = shell.occupancy(vertices, thickness, core)
     origin, direction = np.array([[0.001, 0.001, -0.6]]), np.array([[0.0, 0.0, 1.0]])
-    through, _ = shell.intervals(shell.occupancy(vertices, thickness, NONE), origin, direction)
-    stopped, count = shell.intervals(grid, origin, direction)
+    through, *_ = shell.intervals(shell.occupancy(vertices, thickness, NONE), origin, direction)
+    stopped, count, met = shell.intervals(grid, origin, direction)
     assert count[0] == 1 and (through[0, :2, 0] > 0).all()
     np.testing.assert_allclose(stopped[0, 0], through[0, 0])
+    assert met[0] and not shell.intervals(grid, origin + [0.3, 0, 0], direction)[2][0]
+    samples = shell.sample(stopped, count, 0.002, 8, None, met)
+    assert samples.closed.tolist() == [False] * (len(samples.ray) - 1) + [True]
+    assert not shell.sample(stopped, count, 0.002, 8, None).closed.any()
 
 
 @pytest.mark.parametrize("direction", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 0], [1e-15, 0, 1]])
@@ -68,7 +72,7 @@ def test_axis_aligned_rays_and_cameras_inside(head: tuple[np.ndarray, np.ndarray
     grid = shell.occupancy(vertices, thickness, NONE)
     direction = np.array([direction], float)
     for origin in (np.zeros((1, 3)), vertices[:1], -0.5 * direction, np.full((1, 3), 5.0)):
-        found, count = shell.intervals(grid, origin, direction)
+        found, count, met = shell.intervals(grid, origin, direction)
         assert np.isfinite(found).all() and (found[0, : count[0], 0] >= 0).all()
         middles = found[0, : count[0]].mean(1)
         assert in_shell(origin + middles[:, None] * direction, vertices, thickness).all() if count[0] else True
@@ -84,7 +88,7 @@ def test_grazing_ray_has_a_short_interval_and_at_least_one_sample(head: tuple[np
     y, z = (cell + 0.5) * shell.VOXEL_M + grid.origin[1:]
     direction = np.array([[1.0, -1.0, 0.0]]) / np.sqrt(2)
     origin = np.array([[top - 1e-5, y + 0.002 - 1e-5, z]]) - 0.5 * direction
-    found, count = shell.intervals(grid, origin, direction)
+    found, count, met = shell.intervals(grid, origin, direction)
     samples = shell.sample(found, count, 0.002, 8, None)
     assert count[0] == 0 or len(samples.ray) >= 1
     assert np.isfinite(samples.distance_m).all() and (samples.step_m >= 0).all()

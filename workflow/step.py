@@ -223,7 +223,7 @@ def main(run: Callable[[Job], None], config_type: type, argv: list[str] | None =
         _failed(log, temporary, "interrupted; run snakemake again to continue")
         raise SystemExit(130) from None
     except OSError as error:
-        if error.errno != errno.ENOSPC:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             _failed(log, temporary, str(error))
             raise
         raise SystemExit(_failed(log, temporary, "no space left on the disk; free some and run snakemake again")) from None

@@ -106,6 +106,6 @@ rule evaluate:
         config=config_of("evaluate"),
         code=code_of("avatar.evaluate"),
         asset=sha_of("lpips_alexnet.ckpt"),
-        run=step("avatar.evaluate", device=True),
+        run=step("avatar.evaluate"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"

@@ -123,7 +123,6 @@ rule fit:
 rule trim:
     input:
         head="resources/heads/anny.npz",
-        frames="results/{subject}/frames/frames.npy",
         alpha="results/{subject}/matte/alpha.npy",
         track="results/{subject}/fit/track.npz",
     output:
