@@ -51,17 +51,6 @@ def core_points(vertices_m: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return centres[(distance[:, 0] > CORE_DEPTH_M) & (behind.mean(1) > 0.9)].astype(np.float32)
 
 
-def vertex_normals(vertices_m: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Area-weighted outward normals [V, 3]; zero where all triangles around a vertex are flat."""
-    a, b, c = (vertices_m[triangles[:, i]] for i in range(3))
-    face = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices_m)
-    for corner in range(3):
-        np.add.at(normals, triangles[:, corner], face)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.where(length > 0, length, 1)
-
-
 def occupancy(vertices_m: np.ndarray, thickness_m: np.ndarray, core_m: np.ndarray) -> Grid:
     """The shell of one posed head.
 

@@ -19,6 +19,7 @@ from avatar.dataset import Cells, Scene, cells_of, draw, on_white, shrink_any
 from avatar.layers import best_precision
 from fitting.files import load_head
 from fitting.head_model import HeadModel
+from fitting.raster import vertex_normals
 from workflow import step
 
 CHECKPOINT_S = 60.0
@@ -86,7 +87,7 @@ def make_avatar(job: step.Job, data: Data) -> nn.Module:
     neutral, triangles = data.scene.neutral_m.numpy().astype(np.float64), data.head.triangles.numpy()
     base = coverage.base_thickness(data.head.region.numpy(), neutral, triangles)
     thickness = coverage.measured_thickness(data.scene, data.alpha, looked_at, base)
-    core = shell.core_points(neutral, shell.vertex_normals(neutral, triangles))
+    core = shell.core_points(neutral, vertex_normals(neutral, triangles))
     avatar.shape_shell(torch.from_numpy(thickness), torch.from_numpy(core))
     job.log.info("shell: %.0f to %.0f mm, median %.0f mm", *(1000 * np.quantile(thickness, (0, 1, 0.5))))
     return avatar.to(job.device)

@@ -7,6 +7,7 @@ import pytest
 from toy_head import toy_head
 
 from avatar import shell
+from fitting.raster import vertex_normals
 
 NONE = np.zeros((0, 3), np.float32)
 
@@ -51,7 +52,7 @@ def test_intervals_equal_dense_sampling(head: tuple[np.ndarray, np.ndarray]) -> 
 def test_a_ray_ends_at_the_core_and_the_core_is_deep_inside(head: tuple[np.ndarray, np.ndarray]) -> None:
     vertices, thickness = head
     triangles = toy_head().triangles.numpy()
-    core = shell.core_points(vertices, shell.vertex_normals(vertices, triangles))
+    core = shell.core_points(vertices, vertex_normals(vertices, triangles))
     assert len(core) > 1000
     assert ((core / (0.075, 0.105, 0.09)) ** 2).sum(1).max() < 1
     grid = shell.occupancy(vertices, thickness, core)
@@ -131,6 +132,6 @@ def test_wild_vertices_do_not_grow_the_grid_without_bound(head: tuple[np.ndarray
 def test_normals_point_outwards_and_flat_triangles_do_no_harm(head: tuple[np.ndarray, np.ndarray]) -> None:
     vertices, _ = head
     triangles = np.concatenate([toy_head().triangles.numpy(), [[0, 0, 1]]])
-    normals = shell.vertex_normals(vertices, triangles)
+    normals = vertex_normals(vertices, triangles)
     assert np.isfinite(normals).all() and ((normals * vertices).sum(1) > 0).all()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
