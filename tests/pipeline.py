@@ -48,7 +48,9 @@ for name, path in outputs.items():
     with open(path, "w") as file:
         json.dump(content, file)
 '''
-RUN = "import sys; sys.executable = {stub!r}; from snakemake.cli import main; main(sys.argv[1:])"
+# A shell that runs the tests in the background makes its children ignore Ctrl-C: they must hear it here.
+HEAR = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
+RUN = HEAR + "; sys.executable = {stub!r}; from snakemake.cli import main; main(sys.argv[1:])"
 
 
 @dataclass
