@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from fitting import camera
+
 EMPTY = -1
 
 
@@ -69,8 +71,7 @@ def rasterise(points: np.ndarray, triangles: np.ndarray, size: tuple[int, int]) 
 
 def project(vertices: np.ndarray, focal_px: float, centre_px: np.ndarray) -> np.ndarray:
     """Pinhole projection of camera-space points [..., 3] m to (x px, y px, z m)."""
-    depth = vertices[..., 2:]
-    return np.concatenate([focal_px * vertices[..., :2] / depth + np.asarray(centre_px), depth], -1)
+    return np.concatenate([camera.project(vertices, focal_px, np.asarray(centre_px)), vertices[..., 2:]], -1)
 
 
 def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
