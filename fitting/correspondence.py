@@ -24,7 +24,8 @@ FACING = 0.35  # least cosine between surface normal and view for a point to cou
 SIZE_PX, FOCAL_PX, DISTANCE_M = 768, 1500.0, 0.6
 IRIS_RADIUS_M = 0.0058
 UNSTABLE_M = 0.004  # a landmark that wanders further over the surface from view to view has no place
-MOUTH_OPEN = {"jawOpen": 0.15}
+MOUTH_OPEN = {"jawOpen": 0.15}  # of a head whose actions open its mouth
+JAW_OPEN_RAD = 0.06  # of a head whose jaw joint does
 
 
 @dataclass
@@ -51,7 +52,8 @@ def place(head: HeadModel, detect: Callable[[np.ndarray], np.ndarray | None]) ->
         if name in head.expression_names:
             open_mouth[0, head.expression_names.index(name)] = value
     shape = torch.zeros(len(head.shape_basis))
-    posed = head.local(shape, open_mouth, torch.zeros(1, 3))[0].numpy().astype(np.float64)
+    by_joint = float((head.skinning_weights[:, 2] > 0.5).any()) * JAW_OPEN_RAD
+    posed = head.local(shape, open_mouth, torch.tensor([[by_joint, 0.0, 0.0]]))[0].numpy().astype(np.float64)
     triangles, template = head.triangles.numpy(), head.template.numpy().astype(np.float64)
     seen: list[np.ndarray] = []  # a view each: surface points [478, 3], NaN where not seen well
     for yaw in YAWS_RAD:

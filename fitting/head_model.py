@@ -7,7 +7,8 @@ One letter an axis: T frames, V vertices, S shape and E expression coefficients,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import hashlib
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,15 @@ class HeadModel:
     landmark_barycentric: Tensor  # [L, 3], rows sum to 1
     name: str
     licence: str
-    digest: str  # sha256 over the arrays, first 16 hex digits: stored in every track and avatar
+    digest: str  # `content_digest()` of the finished model: stored in every track and avatar
+    joint_expression_basis: Tensor | None = None  # [E, 5, 3] m per unit; None becomes zeros (joints that expressions leave alone)
+    source: str = ""  # what it was baked from: sha256 of the user's file, or package and version
+    version: str = ""  # of the source model, such as "2023 Open"
+
+    def __post_init__(self) -> None:
+        if self.joint_expression_basis is None:
+            zeros = self.expression_basis.new_zeros(len(self.expression_basis), len(JOINTS), 3)
+            object.__setattr__(self, "joint_expression_basis", zeros)
 
     @staticmethod
     def load(path: Path | str, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> HeadModel:
@@ -55,6 +64,8 @@ class HeadModel:
                 arrays = {name: file[name] for name in file.files}
             values = {}
             for item in fields(HeadModel):
+                if item.name not in arrays and item.default is not MISSING:
+                    continue  # baked before the field existed
                 array = arrays[item.name]
                 if array.dtype.kind == "U":
                     values[item.name] = tuple(array.tolist()) if array.ndim else str(array)
@@ -73,6 +84,35 @@ class HeadModel:
             **{name: value.cpu().numpy() if isinstance(value, Tensor) else np.array(value) for name, value in arrays.items()},
         )
 
+    def content_digest(self) -> str:
+        """First 16 hex digits of the sha256 over what gives a track its meaning: names, geometry, ranges, texture layout.
+
+        Reals are rounded to a millionth (a micrometre), so that BLAS kernels do not change it.
+        """
+        total = hashlib.sha256(" ".join(self.expression_names).encode())
+        for array in (
+            self.template,
+            self.shape_basis,
+            self.expression_basis,
+            self.expression_low,
+            self.expression_high,
+            self.pose_basis,
+            self.joints,
+            self.joint_shape_basis,
+            self.joint_expression_basis,
+            self.skinning_weights,
+            self.triangles,
+            self.uvs,
+            self.uv_triangles,
+            self.region,
+            self.landmark_triangles,
+        ):
+            values = array.cpu().numpy()
+            if values.dtype.kind == "f":
+                values = np.round(np.clip(values.astype(np.float64), -1e9, 1e9) * 1e6)  # a range may be infinite
+            total.update(f"{values.shape}".encode() + values.astype(np.int64).tobytes())
+        return total.hexdigest()[:16]
+
     @property
     def vertex_count(self) -> int:
         return self.template.shape[0]
@@ -88,9 +128,10 @@ class HeadModel:
         """
         return self.template + torch.einsum("s,svd->vd", shape, self.shape_basis)
 
-    def joints_of(self, shape: Tensor) -> Tensor:
-        """Rest joints [5, 3] m of one identity, shape [S]."""
-        return self.joints + torch.einsum("s,sjd->jd", shape, self.joint_shape_basis)
+    def joints_of(self, shape: Tensor, expression: Tensor | None = None) -> Tensor:
+        """Rest joints of one identity, shape [S]: [5, 3] m, or [T, 5, 3] m under expressions [T, E] (FLAME's move its joints)."""
+        rest = self.joints + torch.einsum("s,sjd->jd", shape, self.joint_shape_basis)
+        return rest if expression is None else rest + torch.einsum("te,ejd->tjd", expression, self.joint_expression_basis)
 
     def local(
         self, shape: Tensor, expression: Tensor, jaw: Tensor, eyes: Tensor | None = None, neck: Tensor | None = None
@@ -116,37 +157,40 @@ class HeadModel:
         if len(self.pose_basis):
             correctives = (rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten(1)
             posed = posed + torch.einsum("tp,pvd->tvd", correctives, self.pose_basis)
-        rest = self.joints_of(shape)
+        rest = self.joints_of(shape, expression)[:, :, None]  # [T, 5, 1, 3]
         result = posed * self.skinning_weights[:, 1:2]  # neck joint: the frame itself
         # Root: undo the neck rotation about the neck joint.
-        around_neck = torch.einsum("tji,tvj->tvi", rotations[:, 0], posed - rest[1]) + rest[1]
+        around_neck = torch.einsum("tji,tvj->tvi", rotations[:, 0], posed - rest[:, 1]) + rest[:, 1]
         result = result + around_neck * self.skinning_weights[:, 0:1]
         for joint in (2, 3, 4):  # children of the neck joint
-            turned = torch.einsum("tij,tvj->tvi", rotations[:, joint - 1], posed - rest[joint]) + rest[joint]
+            turned = torch.einsum("tij,tvj->tvi", rotations[:, joint - 1], posed - rest[:, joint]) + rest[:, joint]
             result = result + turned * self.skinning_weights[:, joint : joint + 1]
         return result
 
-    def rigid(self, shape: Tensor, rotation: Tensor, neck: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+    def rigid(
+        self, shape: Tensor, rotation: Tensor, neck: Tensor, translation: Tensor, expression: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """The rigid head transform M of each frame: root rotation, neck rotation and translation in one.
 
         Args:
             shape: [S]; rotation, neck: [T, 3] axis-angle; translation: [T, 3] m.
+            expression: [T, E]; None is neutral, which is exact for a model whose expressions leave the joints alone.
 
         Returns:
             rotation matrices [T, 3, 3] and offsets [T, 3]: a head-frame point x lies at `R x + t` in camera axes.
         """
-        rest = self.joints_of(shape)
+        rest = self.joints_of(shape, shape.new_zeros(1, len(self.expression_names)) if expression is None else expression)
         root = axis_angle_to_matrix(rotation)
         bent = axis_angle_to_matrix(neck)
-        offset = rest[1] - torch.einsum("tij,j->ti", bent, rest[1])  # neck joint stays where it is
-        turned = torch.einsum("tij,tj->ti", root, offset - rest[0]) + rest[0]
+        offset = rest[:, 1] - (bent @ rest[:, 1, :, None])[..., 0]  # neck joint stays where it is
+        turned = torch.einsum("tij,tj->ti", root, offset - rest[:, 0]) + rest[:, 0]
         return root @ bent, turned + translation
 
     def forward(
         self, shape: Tensor, expression: Tensor, rotation: Tensor, neck: Tensor, jaw: Tensor, eyes: Tensor, translation: Tensor
     ) -> Tensor:
         """Posed vertices [T, V, 3] m in camera axes; arguments as in `local` and `rigid`."""
-        matrix, offset = self.rigid(shape, rotation, neck, translation)
+        matrix, offset = self.rigid(shape, rotation, neck, translation, expression)
         return torch.einsum("tij,tvj->tvi", matrix, self.local(shape, expression, jaw, eyes, neck)) + offset[:, None]
 
     def landmarks(self, vertices: Tensor) -> Tensor:

@@ -16,17 +16,19 @@ rule fetch:
 
 rule head:
     input:
+        unpack(head_files),
         landmarker=asset("face_landmarker.task"),
     output:
-        head="resources/heads/anny.npz",
-        report="resources/heads/anny.json",
+        head=HEAD,
+        report=HEAD.replace(".npz", ".json"),
     log:
-        "logs/heads/anny.log",
+        f"logs/heads/{SETTINGS.head.model}.log",
     threads: 2
     params:
         config=config_of("head"),
-        code=code_of("fitting.head"),
+        code=code_of("fitting.head", (HEAD_SOURCE,)),
         asset=sha_of("face_landmarker.task"),
-        run=step("fitting.head", subject="anny"),
+        files=content_of_head_files,
+        run=step("fitting.head", subject=SETTINGS.head.model),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"

@@ -5,7 +5,7 @@
 # The folder {variant}/checkpoints is no output: Snakemake would delete it before a run is continued.
 rule train:
     input:
-        head="resources/heads/anny.npz",
+        head=HEAD,
         frames="results/{subject}/frames/frames.npy",
         alpha="results/{subject}/trim/alpha.npy",
         track="results/{subject}/fit/track.npz",
@@ -33,7 +33,7 @@ rule train:
 
 rule render:
     input:
-        head="resources/heads/anny.npz",
+        head=HEAD,
         avatar="results/{subject}/{variant}/avatar.pt",
         frames="results/{subject}/frames/frames.npy",
         index="results/{subject}/frames/frames.json",
@@ -63,7 +63,7 @@ rule render:
 
 rule baseline:
     input:
-        head="resources/heads/anny.npz",
+        head=HEAD,
         frames="results/{subject}/frames/frames.npy",
         index="results/{subject}/frames/frames.json",
         alpha="results/{subject}/trim/alpha.npy",

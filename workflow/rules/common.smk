@@ -1,6 +1,7 @@
 # The only place with Python: config checked, videos found, and the helpers that the rules share.
 # Parsed again by every cluster job: nothing here imports torch, and nothing prints.
 import atexit
+import hashlib
 import json
 import shlex
 import sys
@@ -24,10 +25,20 @@ try:
         CONFIG,
     )
     checks.check_names(SETTINGS.assets, ASSETS, "assets", CONFIG)
+    # The user's own files of the head model, by the name under which the step knows them.
+    HEAD_KEYS = {"model": "path", "uv": "uv", "masks": "masks", "landmark_embedding": "landmark_embedding"}
+    HEAD_FILES = {name: getattr(SETTINGS.head, key) for name, key in HEAD_KEYS.items() if getattr(SETTINGS.head, key)}
+    HEAD_FILES = {name: str(Path(path).expanduser()) for name, path in HEAD_FILES.items()}
+    for name, path in HEAD_FILES.items():
+        if not Path(path).is_file():
+            where = "; FLAME is at https://flame.is.tue.mpg.de (registration needed)"
+            raise checks.SettingsError(f"{CONFIG}: head.{HEAD_KEYS[name]}: there is no file {path}{where}")
     VIDEOS = checks.discover(Path(SETTINGS.videos))
 except checks.SettingsError as mistake:
     raise SystemExit(str(mistake)) from None
 
+HEAD = f"resources/heads/{SETTINGS.head.model}.npz"
+HEAD_SOURCE = {"anny": "fitting.anny_head", "flame": "fitting.flame"}[SETTINGS.head.model]
 SUBJECTS = list(VIDEOS)
 ALL_VARIANTS = [*VARIANTS, *PREDICTORS]
 # Once a run: an edit while it runs counts in the next one.
@@ -86,9 +97,9 @@ def table_config(wildcards):
     return json.dumps({"subjects": SUBJECTS, "variants": ALL_VARIANTS})
 
 
-def code_of(command):
-    """Digest of the code that a step imports."""
-    return lambda wildcards: digest_of(command)
+def code_of(command, extra=()):
+    """Digest of the code that a step imports, with modules that it imports by name."""
+    return lambda wildcards: digest_of(command, extra)
 
 
 def model_code_of(command):
@@ -109,6 +120,23 @@ def asset(name):
 def sha_of(name):
     """What an asset must hash to: another model is another parameter."""
     return ASSETS[name].sha256
+
+
+def head_files(wildcards):
+    """The user's own files of the head model. Their content counts (see `content_of_head_files`), their time does not."""
+    return {name: ancient(path) for name, path in HEAD_FILES.items()}
+
+
+@cache
+def sha256_of(path):
+    """Hash of a whole file, once a run."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def content_of_head_files(wildcards):
+    """Hashes of the user's own files of the head model: replacing one by another of the same name bakes again."""
+    return {name: sha256_of(path) for name, path in HEAD_FILES.items()}
 
 
 def video_of(wildcards):
