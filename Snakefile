@@ -14,8 +14,10 @@ report: "workflow/report/workflow.rst"
 include: "workflow/rules/common.smk"
 include: "workflow/rules/assets.smk"
 include: "workflow/rules/fitting.smk"
+include: "workflow/rules/export.smk"
 include: "workflow/rules/avatar.smk"
 include: "workflow/rules/report.smk"
+include: "workflow/rules/simulate.smk"
 
 
 rule all:
