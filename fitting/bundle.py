@@ -1,85 +1,159 @@
-"""The bundle: all frames of one part together, with temporal terms."""
+"""The bundle: all frames of one part together, with temporal terms, as one banded linear system an iteration.
+
+Each frame's terms enter as their own quadratic (Hessian, gradient at the current pose); accelerations couple a frame with its two
+neighbours on either side.  The matrix is block-pentadiagonal and solved exactly in O(T d^3).
+"""
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
 
 import numpy as np
+import scipy.linalg
 
-from fitting import camera, energy, solver
-from fitting.energy import State, Weights
-from fitting.landmark_model import LandmarkModel
-from fitting.stages import Observed
+from fitting import camera
+from fitting.energy import Problem
+from fitting.rig import GAZE, JAW
+from fitting.state import State
+
+JUMP_DEGREES, JUMP_M = 15.0, 0.06  # a change from one frame to the next beyond this is a cut
 
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Standard deviations of the second difference from frame to frame, at 30 frames a second."""
+    """Standard deviations of the acceleration, per (1/30 s) squared: the second difference at 30 frames a second."""
 
     rotation_rad: float
     across_m: float
     depth_m: float
     expression: float
     gaze_rad: float
+    jaw_rad: float
 
-    def at_rate(self, fps: float) -> Smoothness:
-        """The same accelerations a second at another frame rate: a second difference grows with the square of its interval."""
-        return Smoothness(*(value * (30 / fps) ** 2 for value in astuple(self)))
+    def deviation(self, expressions: int) -> np.ndarray:
+        """One standard deviation per unknown [d]."""
+        rotation, across, depth, expression, gaze, jaw = astuple(self)
+        return np.concatenate(
+            [np.full(3, rotation), [across, across, depth], np.full(expressions, expression), np.full(GAZE, gaze), np.full(JAW, jaw)]
+        )
+
+
+def stencils(time_s: np.ndarray, cut: np.ndarray) -> np.ndarray:
+    """Coefficients [T - 2, 3] of the acceleration at each inner frame, per (1/30 s) squared; zero across a cut.
+
+    Args:
+        time_s: [T]; cut: [T] bool, a frame that does not continue the one before it.
+    """
+    step = np.diff(time_s)
+    step = np.maximum(step, 0.25 * np.median(step)) if len(step) else step  # duplicated frames
+    first, second = step[:-1], step[1:]
+    unit = (1 / 30) ** 2
+    rows = np.stack(
+        [2 / (first * (first + second)), -2 / (first * second), 2 / (second * (first + second))], 1
+    ) * unit
+    return np.where((cut[1:-1] | cut[2:])[:, None], 0.0, rows)
+
+
+def cuts(state: State, found: np.ndarray) -> np.ndarray:
+    """Frames [T] bool whose pose jumps away from the frame before: a cut, or a track that was lost and found."""
+    jump = np.zeros(len(state), bool)
+    if len(state) > 1:
+        angle = np.degrees(np.linalg.norm(camera.log_rotation(state.rotation[1:] @ state.rotation[:-1].swapaxes(1, 2)), axis=1))
+        way = np.linalg.norm(np.diff(state.translation, axis=0), axis=1)
+        jump[1:] = ((angle > JUMP_DEGREES) | (way > JUMP_M)) & found[1:] & found[:-1]
+    return jump
+
+
+def acceleration(state: State, stencil: np.ndarray) -> np.ndarray:
+    """Accelerations [T - 2, d]; those of the rotation are differences of relative rotation vectors."""
+    flat = np.concatenate([state.translation, state.expression, state.gaze, state.jaw], 1)
+    back, here, on = flat[:-2], flat[1:-1], flat[2:]
+    straight = stencil[:, :1] * (back - here) + stencil[:, 2:] * (on - here)
+    turn = camera.log_rotation(state.rotation[1:] @ state.rotation[:-1].swapaxes(1, 2))
+    turned = -stencil[:, :1] * turn[:-1] + stencil[:, 2:] * turn[1:]
+    return np.concatenate([turned, straight], 1)
 
 
 def smooth(
-    model: LandmarkModel,
-    observed: Observed,
-    rows: np.ndarray,
-    weights: Weights,
+    problem_of: Callable[[int, State], Problem | None],
     state: State,
-    smoothness: Smoothness,
-    sweeps: int,
-) -> State:
-    """Bundle over consecutive frames: landmark energy plus accelerations, shared unknowns held.
-
-    Frames that are three apart do not meet in any acceleration, so a third of all frames is solved at once (one damped
-    Gauss-Newton step each) while the others stand still.  Closes the seams between blocks and takes the detector's jitter out;
-    frames without a face are carried by their neighbours.
+    stencil: np.ndarray,
+    deviation: np.ndarray,
+    iterations: int,
+) -> tuple[State, list[float]]:
+    """Bundle over consecutive frames, shared unknowns held.
 
     Args:
-        rows: [B] consecutive frame numbers of one part (training or test); state: of these rows.
+        problem_of: the problem of the k-th frame around a state, None for a frame without a face (carried by its neighbours).
+        state: of these frames; stencil: [T - 2, 3] from `stencils`; deviation: [d] from `Smoothness`.
+
+    Returns:
+        state and the total cost at each iteration; a step that does not lower the cost is halved, then given up.
     """
-    if len(rows) < 5:
-        return state
-    count = state.expression.shape[1]
-    deviation = np.concatenate(
-        [
-            np.full(3, smoothness.rotation_rad),
-            [smoothness.across_m, smoothness.across_m, smoothness.depth_m],
-            np.full(count, smoothness.expression),
-            np.full(energy.GAZE, smoothness.gaze_rad),
-        ]
-    )
-    for sweep in range(3 * sweeps):
-        some = np.arange(2 + sweep % 3, len(rows) - 2, 3)
-        normal = energy.linearise(model, observed.frames(rows[some]), weights, state.frame(some))
-        pull = _acceleration_anchor(state, some)  # where the neighbours would put this frame, as a step
-        precision = 6 / deviation**2
-        hessian = normal.hessian + np.diag(precision)
-        step = -solver.damped_solve(hessian, normal.gradient - precision * pull, 1e-3)
-        moved = energy.update(state.frame(some), step, None)
-        values = {name: getattr(state, name).copy() for name in ("rotation", "translation", "expression", "gaze")}
-        for name, value in values.items():
-            value[some] = getattr(moved, name)
-        state = replace(state, **values)
-    return state
+    count, unknowns = len(state), len(deviation)
+    if count < 3:
+        return state, []
+    precision = 1 / deviation**2
+
+    def measure(at: State) -> tuple[float, np.ndarray, np.ndarray]:
+        hessian, gradient, total = np.zeros((count, unknowns, unknowns)), np.zeros((count, unknowns)), 0.0
+        for k in range(count):
+            problem = problem_of(k, at)
+            if problem is None:
+                hessian[k] = np.diag(1e-4 * precision)  # keeps a lost tail where it is
+                continue
+            cost, evaluated = problem.evaluate(at.pose(k))
+            hessian[k], gradient[k] = problem.normal(at.pose(k), evaluated)
+            total += cost
+        return total + 0.5 * float((acceleration(at, stencil) ** 2 * precision).sum()), hessian, gradient
+
+    cost, hessian, gradient = measure(state)
+    costs = [cost]
+    for _ in range(iterations):
+        step = _solve(hessian, gradient, acceleration(state, stencil), stencil, precision)
+        for _ in range(3):
+            trial = state.with_poses([state.pose(k).moved(step[k]) for k in range(count)])
+            new, trial_hessian, trial_gradient = measure(trial)
+            if np.isfinite(new) and new < cost:
+                break
+            step = step / 2
+        else:
+            break
+        state, hessian, gradient = trial, trial_hessian, trial_gradient
+        gain, cost = cost - new, new
+        costs.append(cost)
+        if gain < 1e-3 * cost:
+            break
+    return state, costs
 
 
-def _acceleration_anchor(state: State, rows: np.ndarray) -> np.ndarray:
-    """Step [B, 6 + E + 4] from each row's parameters to the minimum of the five-frame acceleration energy around it.
+def _solve(hessian: np.ndarray, gradient: np.ndarray, bend: np.ndarray, stencil: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """Gauss-Newton step [T, d] of frames and accelerations together (banded Cholesky, Jacobi-scaled)."""
+    count, unknowns = gradient.shape
+    total, right = hessian.copy(), gradient.copy()
+    diagonal = np.arange(unknowns)
+    near, far = np.zeros((count, unknowns)), np.zeros((count, unknowns))  # coupling of frame k with k + 1 and k + 2
+    for offset in range(3):
+        right[offset : count - 2 + offset] += stencil[:, offset : offset + 1] * precision * bend
+        np.add.at(
+            total,
+            (np.arange(offset, count - 2 + offset)[:, None], diagonal, diagonal),
+            stencil[:, offset : offset + 1] ** 2 * precision,
+        )
+    near[: count - 2] += (stencil[:, 0] * stencil[:, 1])[:, None] * precision
+    near[1 : count - 1] += (stencil[:, 1] * stencil[:, 2])[:, None] * precision
+    far[: count - 2] += (stencil[:, 0] * stencil[:, 2])[:, None] * precision
+    scale = 1 / np.sqrt(np.maximum(np.einsum("kii->ki", total), 1e-30))
+    band = np.zeros((2 * unknowns + 1, count * unknowns))
+    scaled = total * scale[:, :, None] * scale[:, None, :]
+    for below in range(unknowns):  # lower form: band[i - j, j]
+        columns = (np.arange(count)[:, None] * unknowns + np.arange(unknowns - below)).ravel()
+        band[below, columns] = scaled[:, np.arange(below, unknowns), np.arange(unknowns - below)].ravel()
+    band[0] += 1e-9
+    flat = scale.ravel()
+    band[unknowns, : (count - 1) * unknowns] = near[:-1].ravel() * flat[unknowns:] * flat[:-unknowns]
+    band[2 * unknowns, : (count - 2) * unknowns] = far[:-2].ravel() * flat[2 * unknowns :] * flat[: -2 * unknowns]
+    return -(scipy.linalg.solveh_banded(band, right.ravel() * flat, lower=True) * flat).reshape(count, unknowns)
 
-    The three second differences that contain x_t have their joint minimum at (4 (x_-1 + x_+1) - x_-2 - x_+2) / 6, precision 6.
-    """
-    flat = np.concatenate([state.translation, state.expression, state.gaze], 1)
-    own = state.rotation[rows]
-    total = np.zeros((len(rows), 3 + flat.shape[1]))
-    for offset, weight in ((-2, -1), (-1, 4), (1, 4), (2, -1)):
-        total[:, :3] += weight * camera.log_rotation(state.rotation[rows + offset] @ own.swapaxes(1, 2))
-        total[:, 3:] += weight * (flat[rows + offset] - flat[rows])
-    return total / 6
+

@@ -9,9 +9,11 @@ SMALL = 1e-4  # below this angle (rad) the series are exact to float64
 
 def cross_matrix(vector: np.ndarray) -> np.ndarray:
     """Matrices [..., 3, 3] with `cross_matrix(a) @ b == cross(a, b)` of vectors [..., 3]."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape[:-1], 3, 3)
+    out = np.zeros((*vector.shape, 3))
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
+    return out
 
 
 def _series(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -54,6 +56,8 @@ def project(points: np.ndarray, focal_px: float, centre_px: np.ndarray) -> np.nd
 
 def project_jacobian(points: np.ndarray, focal_px: float) -> np.ndarray:
     """Derivative [..., 2, 3] of `project` with respect to the points [..., 3], px per m."""
-    x, y, z = np.moveaxis(points, -1, 0)
-    zero = np.zeros_like(x)
-    return focal_px * np.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], -1).reshape(*points.shape[:-1], 2, 3)
+    near = focal_px / points[..., 2]
+    out = np.zeros((*points.shape[:-1], 2, 3))
+    out[..., 0, 0] = out[..., 1, 1] = near
+    out[..., 2] = -points[..., :2] * (near / points[..., 2])[..., None]
+    return out

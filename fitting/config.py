@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 
 class StepConfig(BaseModel):
@@ -25,9 +25,41 @@ class FetchConfig(StepConfig):
 class HeadConfig(StepConfig):
     """head: bake the head model into one file."""
 
-    model: Literal["anny"] = Field("anny", description="Head model: `anny`, the open default.")
-    shape_components: int = Field(80, ge=10, le=200, description="Principal components of identity that are kept.")
-    samples: int = Field(600, ge=100, le=5000, description="Random heads from which the identity space is computed.")
+    model: Literal["anny", "flame"] = Field("anny", description="Head model: `anny`, which is open, or `flame`, your own file.")
+    shape_components: int | None = Field(
+        None, ge=10, le=300, description="Components of identity that are kept; null: 80 of anny, 100 of flame."
+    )
+    samples: int = Field(600, ge=100, le=5000, description="anny: random heads from which the identity space is computed.")
+    path: str | None = Field(
+        None,
+        validate_default=True,
+        description="flame: your file of FLAME 2020, 2023 or 2023 Open (`.pkl` or `.npz`), from https://flame.is.tue.mpg.de.",
+    )
+    expression_components: int = Field(50, ge=10, le=100, description="flame: components of expression that are kept.")
+    jaw: bool | None = Field(
+        None, description="flame: whether the jaw moves by its joint; null: yes, but not for a file with `no_jaw` in its name."
+    )
+    mouth_cavity: bool = Field(False, description="flame: add a mouth cavity between the lips and a line behind them.")
+    uv: str | None = Field(None, description="flame: your head_template_mesh.obj for its texture layout; null makes one.")
+    masks: str | None = Field(None, description="flame: your FLAME_masks.pkl for the regions; null finds them by geometry.")
+    landmark_embedding: str | None = Field(
+        None, description="flame: your mediapipe_landmark_embedding.npz; landmarks that are not in it are placed by detection."
+    )
+
+    @field_validator("path", "uv", "masks", "landmark_embedding")
+    @classmethod
+    def _belongs_to_flame(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if info.data.get("model") == "flame" and info.field_name == "path" and not value:
+            raise ValueError("FLAME is not shipped: get it at https://flame.is.tue.mpg.de (registration) and name your file here")
+        if info.data.get("model") == "anny" and value:
+            raise ValueError("this is read for head.model=flame only; set that too, or leave it out")
+        return value
+
+    @model_validator(mode="after")
+    def _anny_has_fewer(self) -> HeadConfig:
+        if self.model == "anny" and self.shape_components and 2 * self.shape_components > self.samples:
+            raise ValueError("samples must be at least twice shape_components")
+        return self
 
 
 class ProbeConfig(StepConfig):
@@ -59,6 +91,18 @@ class SplitConfig(StepConfig):
     )
 
 
+class TermWeights(StepConfig):
+    """How much each term of the fit counts; 1 is the tuned value, 0 leaves the term out."""
+
+    landmarks: float = Field(1.0, gt=0, le=100, description="Detected landmarks, brows, nose, lips and outline.")
+    irises: float = Field(1.0, ge=0, le=100, description="Iris centres among the landmarks: the gaze.")
+    eyelids: float = Field(1.0, ge=0, le=100, description="Gap between the lids: blinks.")
+    photometric: float = Field(1.0, ge=0, le=100, description="Skin keeps its colour from frame to frame.")
+    silhouette: float = Field(1.0, ge=0, le=100, description="Skull, ears and jaw against the edge of the matte.")
+    priors: float = Field(1.0, ge=0, le=100, description="Expression near the detector's own scores.")
+    temporal: float = Field(1.0, ge=0, le=100, description="Accelerations: closes the seams between blocks, calms jitter.")
+
+
 class FitConfig(StepConfig):
     """fit: camera and head parameters of every frame."""
 
@@ -68,7 +112,12 @@ class FitConfig(StepConfig):
     reinit_every: int = Field(
         200, ge=10, description="Frames between re-initialisations (pose by PnP, expression neutral), as in the paper."
     )
-    iterations: int = Field(6, ge=1, le=100, description="Gauss-Newton iterations a frame at most.")
+    solver: Literal["gauss_newton", "adam"] = Field(
+        "gauss_newton", description="`adam` is Neural Head Avatars' recipe, to compare with: same terms, many more steps."
+    )
+    iterations: int = Field(4, ge=1, le=100, description="Gauss-Newton iterations a frame at most.")
+    adam_steps: int = Field(50, ge=1, le=5000, description="Steps a frame of `solver: adam`.")
+    weights: TermWeights = Field(TermWeights(), description="Weight of each term.")
     focal_px: float | None = Field(
         None, gt=0, description="Focal length in pixels of the source video where it is known; null estimates it from the clip."
     )
@@ -80,3 +129,30 @@ class TrimConfig(StepConfig):
     neck_margin_m: float = Field(
         0.02, ge=0, le=0.1, description="How far (m) beside the mesh's neck skin is kept below the chin."
     )
+
+
+class ExportConfig(StepConfig):
+    """export: the track in formats that other FLAME programs open (made when asked for: `snakemake export_all`)."""
+
+    pictures: Literal["all", "train", "test"] = Field(
+        "all", description="Frames whose pictures and masks the folder for GaussianAvatars holds: of both splits or of one."
+    )
+
+
+class SimulateConfig(StepConfig):
+    """simulate: a selfie video with a known head, camera and light, to measure a fit against."""
+
+    kind: Literal["still", "slow", "fast", "jump", "profile", "blink", "talk"] = Field("slow", description="How the head moves.")
+    seed: int = Field(0, ge=0, description="Who it is, and every other random choice.")
+    frames: int = Field(300, ge=1, le=5000, description="Frames of the video.")
+    fps: float = Field(30.0, gt=0, le=240, description="Frames a second.")
+    height: int = Field(512, ge=64, le=2160, multiple_of=2, description="Height of the video in pixels.")
+    width: int = Field(512, ge=64, le=2160, multiple_of=2, description="Width of the video in pixels.")
+    focal_px: float | None = Field(None, gt=0, description="Focal length in pixels; null is 1.3 x the longer side.")
+    k1: float = Field(0.0, ge=-0.3, le=0.3, description="Radial distortion of the lens, on the normalised image plane.")
+    distance_m: float = Field(0.5, ge=0.25, le=3, description="Mean distance of the head from the camera (m).")
+    hair: Literal["bald", "short", "full"] = Field("bald", description="Hair; `full` stands off the skull by 1.5 cm.")
+    exposure_stops: float = Field(0.0, ge=0, le=2, description="Drift of the exposure, in stops either way.")
+    noise: float = Field(0.006, ge=0, le=0.1, description="Standard deviation of the sensor noise, part of full scale.")
+    displacement_mm: float = Field(0.7, ge=0, le=5, description="Rms displacement (mm) of the skin that no identity basis holds.")
+    bump_mm: float = Field(1.5, ge=0, le=5, description="Height (mm) of expression bumps that no expression basis holds.")

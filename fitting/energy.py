@@ -1,255 +1,253 @@
-"""The fit's energy: landmark residuals with analytic Jacobians, and priors.  Pure float64 numpy, batched over frames.
+"""The fit's energy: every term is a function from a posed surface to weighted residual rows, and one place adds them up.
 
-Letters: B frames at once, L landmarks, S shape, E expression coefficients.  Unknowns of one frame, in this order:
-    rotation update (3, left-multiplicative: R <- exp(w) R), translation (3, m), expression (E), gaze (4: left pitch, left yaw,
-    right pitch, right yaw, rad).
-Shared unknowns: log focal length (1), shape (S).  The neck stays straight and the jaw joint neutral: landmarks cannot tell the
-neck from the root, and this head model opens its jaw by actions.
+Pure float64 numpy.  Letters: L landmarks, M residual rows, E expression coefficients, S shape, d unknowns of a frame (fitting.rig).
+Robust costs are Huber's, by iteratively reweighted least squares.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fitting import camera
 from fitting.landmark_model import LandmarkModel
-from fitting.solver import Normal
-
-POSE = 6  # rotation and translation
-GAZE = 4
+from fitting.rig import GAZE, JAW, POSE, Pose, Posed, Surface, jacobian, posed
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Standard deviations of the terms; the values stand in `fitting.fit`."""
+    """Standard deviations of the terms; the values stand in `fitting.settings`."""
 
     landmark_sigma: float  # of the inter-ocular distance
     robust_sigmas: float  # Huber's threshold
     correlated: float  # neighbouring landmarks err together: this many count as one
-    expression_sd: float
+    iris: float  # weight of the irises among the landmarks
+    eyelid_sigma: float  # of the lid gap, in inter-ocular distances
+    expression_sd: float  # of an action in [0, 1]
+    statistical_sd: float  # of a coefficient of a statistical basis (unit variance)
     action_wall_sd: float  # softness of the wall at the ends of an action's range
     gaze_sd_rad: float
     vergence_sd_rad: float
+    shut_gaze_sd_rad: float  # how far the gaze may wander behind a shut lid
+    jaw_sd_rad: tuple[float, float, float]
+    jaw_wall_rad: float  # an angle below this is pushed back
     log_focal_sd: float
     shape_sd: float
+    shape_wall: float  # identity coefficients beyond this many standard deviations are pushed back
+    shape_wall_sd: float
 
 
 @dataclass(frozen=True)
-class Frames:
-    """Observations of B frames."""
+class Camera:
+    """Pinhole camera at the origin."""
 
-    points: np.ndarray  # [B, L, 2] px, rows of LandmarkModel.ids
-    weight: np.ndarray  # [B, L] 0 hides a point (outside the picture, held out)
-    scale_px: np.ndarray  # [B] inter-ocular distance as seen head-on
+    focal_px: float
     centre_px: np.ndarray  # [2]
-    expression_mean: np.ndarray  # [B, E] centre of the expression prior
 
 
 @dataclass(frozen=True)
-class State:
-    """Unknowns of B frames and the shared ones."""
+class Frame:
+    """What was seen of one frame."""
 
-    rotation: np.ndarray  # [B, 3, 3]
-    translation: np.ndarray  # [B, 3] m
-    expression: np.ndarray  # [B, E]
-    gaze: np.ndarray  # [B, 4] rad
-    log_focal: float
-    shape: np.ndarray  # [S]
-    bias: np.ndarray  # [L, 3] m in the head frame, constant per landmark: detector and embedding disagree
-
-    @property
-    def focal_px(self) -> float:
-        return float(np.exp(self.log_focal))
-
-    def frame(self, rows: slice | np.ndarray) -> State:
-        """The same shared unknowns, some of the frames."""
-        return replace(
-            self,
-            rotation=self.rotation[rows],
-            translation=self.translation[rows],
-            expression=self.expression[rows],
-            gaze=self.gaze[rows],
-        )
+    points: np.ndarray  # [L, 2] px, rows of LandmarkModel.ids
+    weight: np.ndarray  # [L] 0 hides a point (outside the picture, held out, iris behind a lid)
+    scale_px: float  # inter-ocular distance as seen head-on
+    expression_mean: np.ndarray  # [E] centre of the expression prior
+    open_eyes: np.ndarray  # [2] 1 open, 0 shut; left, right
+    gaze_mean: np.ndarray  # [4] where the gaze is held while an eye is shut
 
 
-def update(state: State, block: np.ndarray, shared: np.ndarray | None) -> State:
-    """Apply a step: block [B, 6 + E + 4], shared [1 + S] or None."""
-    count = state.expression.shape[1]
-    return replace(
-        state,
-        rotation=camera.exp_rotation(block[:, :3]) @ state.rotation,
-        translation=state.translation + block[:, 3:POSE],
-        expression=state.expression + block[:, POSE : POSE + count],
-        gaze=state.gaze + block[:, POSE + count :],
-        log_focal=state.log_focal if shared is None else state.log_focal + shared[0],
-        shape=state.shape if shared is None else state.shape + shared[1:],
-    )
+@dataclass(frozen=True)
+class Rows:
+    """Residual rows of one term in one frame, weighted so that the cost is half their sum of squares to first order."""
+
+    cost: float  # robust
+    residual: np.ndarray  # [M]
+    parts: tuple[tuple[np.ndarray, np.ndarray], ...]  # (covector [M, 3], point [M]): the residual moves with each of these points
+    nuisance: np.ndarray | None = None  # [M, N] weighted columns of unknowns that are eliminated (gain, bias)
 
 
-def head_points(model: LandmarkModel, state: State) -> np.ndarray:
-    """Landmarks in the head frame [B, L, 3] m."""
-    points = model.base + state.bias + np.tensordot(state.shape, model.shape_basis, 1)
-    points = points + np.tensordot(state.expression, model.expression_basis, 1)
-    joint = model.eye_joint + np.tensordot(state.shape, model.eye_joint_basis, 1)
-    turn = camera.exp_rotation(gaze_vectors(state.gaze))  # [B, 2, 3, 3]
-    points[:, model.pupil] = joint + np.einsum("beij,bej->bei", turn, points[:, model.pupil] - joint)
-    return points
+@dataclass(frozen=True)
+class Term:
+    """One term of one frame: a folded surface and the function that compares it with the picture."""
+
+    surface: Surface
+    rows: Callable[[Posed], Rows]
 
 
-def gaze_vectors(gaze: np.ndarray) -> np.ndarray:
-    """Axis-angle vectors [B, 2, 3] of gaze [B, 4]; the eye does not roll."""
-    angles = gaze.reshape(-1, 2, 2)
-    return np.concatenate([angles, np.zeros_like(angles[..., :1])], -1)
-
-
-def residuals(
-    model: LandmarkModel, frames: Frames, weights: Weights, state: State
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Landmark residuals in standard deviations.
-
-    Returns:
-        residual [B, L, 2]; its scale [B, L] (1 / px); points in the head frame and in camera axes [B, L, 3].
-    """
-    local = head_points(model, state)
-    points = np.einsum("bij,blj->bli", state.rotation, local) + state.translation[:, None]
-    sigma = weights.landmark_sigma * frames.scale_px[:, None] * model.group_sigma * np.sqrt(weights.correlated)
-    scale = np.sqrt(frames.weight * visibility(model, state)) / sigma
-    return (camera.project(points, state.focal_px, frames.centre_px) - frames.points) * scale[..., None], scale, local, points
-
-
-def visibility(model: LandmarkModel, state: State) -> np.ndarray:
-    """Weight [B, L]: 1 for a point that faces the camera, falling to 0.02 for one that is turned away (guessed)."""
-    facing = (
-        -np.einsum("bij,lj,bi->bl", state.rotation, model.normal, state.translation)
-        / np.linalg.norm(state.translation, axis=1)[:, None]
-    )
-    return np.clip((facing + 0.1) / 0.4, 0.02, 1.0)
-
-
-def robust(residual: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Huber cost and weight [B, L] of residuals [B, L, 2]."""
-    norm = np.linalg.norm(residual, axis=-1)
+def huber(norm: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Huber cost and weight of residual norms [...]."""
     inside = norm <= threshold
-    return np.where(inside, 0.5 * norm**2, threshold * (norm - 0.5 * threshold)), np.where(
-        inside, 1.0, threshold / np.where(inside, 1.0, norm)
+    return (
+        np.where(inside, 0.5 * norm**2, threshold * (norm - 0.5 * threshold)),
+        np.where(inside, 1.0, threshold / np.where(inside, 1.0, norm)),
     )
 
 
-def prior(model: LandmarkModel, frames: Frames, weights: Weights, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Prior cost [B], gradient [B, E + 4] and diagonal-plus-vergence Hessian [B, E + 4, E + 4] of expression and gaze."""
-    count = state.expression.shape[1]
-    away = (state.expression - frames.expression_mean) / weights.expression_sd
-    below = np.minimum(state.expression - model.low, 0) / weights.action_wall_sd
-    above = np.maximum(state.expression - model.high, 0) / weights.action_wall_sd
-    look = state.gaze / weights.gaze_sd_rad
-    apart = (state.gaze[:, :2] - state.gaze[:, 2:]) / weights.vergence_sd_rad
-    cost = 0.5 * ((away**2).sum(1) + (below**2).sum(1) + (above**2).sum(1) + (look**2).sum(1) + (apart**2).sum(1))
-    gradient = np.concatenate(
-        [away / weights.expression_sd + (below + above) / weights.action_wall_sd, look / weights.gaze_sd_rad], 1
-    )
-    gradient[:, count : count + 2] += apart / weights.vergence_sd_rad
-    gradient[:, count + 2 :] -= apart / weights.vergence_sd_rad
-    hessian = np.zeros((len(away), count + GAZE, count + GAZE))
-    rows = np.arange(count)
-    hessian[:, rows, rows] = 1 / weights.expression_sd**2 + ((below < 0) | (above > 0)) / weights.action_wall_sd**2
-    rows = np.arange(count, count + GAZE)
-    hessian[:, rows, rows] = 1 / weights.gaze_sd_rad**2 + 1 / weights.vergence_sd_rad**2
-    for left in (count, count + 1):
-        hessian[:, left, left + 2] = hessian[:, left + 2, left] = -1 / weights.vergence_sd_rad**2
-    return cost, gradient, hessian
+def facing(normal: np.ndarray, pose: Pose) -> np.ndarray:
+    """Weight [P] of points with template normals [P, 3]: 1 towards the camera, falling to 0.02 where it is turned away."""
+    toward = -(normal @ (pose.rotation.T @ pose.translation)) / np.linalg.norm(pose.translation)
+    return np.clip((toward + 0.1) / 0.4, 0.02, 1.0)
 
 
-def cost(model: LandmarkModel, frames: Frames, weights: Weights, state: State, focal_prior: float | None = None) -> float:
-    """Total robust cost; with focal_prior (log px) the shared priors count too."""
-    residual, *_ = residuals(model, frames, weights, state)
-    total = robust(residual, weights.robust_sigmas)[0].sum() + prior(model, frames, weights, state)[0].sum()
-    if focal_prior is not None:
-        total += (
-            0.5 * ((state.log_focal - focal_prior) / weights.log_focal_sd) ** 2
-            + 0.5 * (state.shape**2).sum() / weights.shape_sd**2
-        )
-    return float(total)
-
-
-def linearise(
-    model: LandmarkModel,
-    frames: Frames,
-    weights: Weights,
-    state: State,
-    focal_prior: float | None = None,
-    pose_only: bool = False,
-) -> Normal:
-    """Normal equations of the frames' blocks; with focal_prior (log px) also of the shared unknowns.
-
-    Args:
-        pose_only: expression and gaze are held (their rows are replaced by the identity).
-    """
-    residual, scale, local, points = residuals(model, frames, weights, state)
-    value, influence = robust(residual, weights.robust_sigmas)
-    root = np.sqrt(influence) * scale
-    to_pixel = camera.project_jacobian(points, state.focal_px) * root[..., None, None]  # [B, L, 2, 3]
-    to_head = to_pixel @ state.rotation[:, None]  # with respect to a point of the head frame
-    count, batch = state.expression.shape[1], len(points)
-    jacobian = np.zeros((batch, len(model.ids), 2, POSE + count + GAZE))
-    jacobian[..., :3] = -to_pixel @ camera.cross_matrix(points - state.translation[:, None])
-    jacobian[..., 3:POSE] = to_pixel
-    vectors = gaze_vectors(state.gaze)
-    turn = camera.exp_rotation(vectors)
-    joint = model.eye_joint + np.tensordot(state.shape, model.eye_joint_basis, 1)
-    if not pose_only:
-        basis = np.moveaxis(model.expression_basis, 0, -1)  # [L, 3, E]
-        jacobian[..., POSE : POSE + count] = np.matmul(to_head, basis)
-        for eye, row in enumerate(model.pupil):
-            arm = local[:, row] - joint[eye]
-            turned = -camera.cross_matrix(arm) @ camera.left_jacobian(vectors[:, eye])
-            columns = slice(POSE + count + 2 * eye, POSE + count + 2 * eye + 2)
-            jacobian[:, row, :, columns] = to_head[:, row] @ turned[..., :2]
-            jacobian[:, row, :, POSE : POSE + count] = to_head[:, row] @ turn[:, eye] @ basis[row]
-    flat = jacobian.reshape(batch, -1, POSE + count + GAZE)
-    right = (residual * np.sqrt(influence)[..., None]).reshape(batch, -1)
-    hessian = flat.swapaxes(1, 2) @ flat
-    gradient = np.einsum("bmd,bm->bd", flat, right)
-    prior_cost, prior_gradient, prior_hessian = prior(model, frames, weights, state)
-    if pose_only:
-        rows = np.arange(POSE, POSE + count + GAZE)
-        hessian[:, rows, rows] = 1.0
-    else:
-        gradient[:, POSE:] += prior_gradient
-        hessian[:, POSE:, POSE:] += prior_hessian
-    normal = Normal(value.sum(1) + prior_cost, hessian, gradient)
-    if focal_prior is None:
-        return normal
-    shared = np.zeros((batch, len(model.ids), 2, 1 + len(state.shape)))
-    offset = (points[..., :2] / points[..., 2:]) * state.focal_px
-    shared[..., 0] = offset * root[..., None]  # d pixel / d log f
-    moved = np.broadcast_to(np.moveaxis(model.shape_basis, 0, -1), (batch, *model.base.shape, len(state.shape))).copy()
-    for eye, row in enumerate(model.pupil):
-        at_joint = model.eye_joint_basis[:, eye].T
-        moved[:, row] = at_joint + turn[:, eye] @ (moved[:, row] - at_joint)
-    shared[..., 1:] = to_head @ moved
-    columns = shared.reshape(batch, -1, 1 + len(state.shape))
-    precision = np.concatenate([[1 / weights.log_focal_sd**2], np.full(len(state.shape), 1 / weights.shape_sd**2)])
-    away = np.concatenate([[state.log_focal - focal_prior], state.shape])
-    stacked = columns.reshape(-1, columns.shape[-1])
-    return replace(
-        normal,
-        cross=flat.swapaxes(1, 2) @ columns,
-        shared_hessian=stacked.T @ stacked + np.diag(precision),
-        shared_gradient=stacked.T @ right.reshape(-1) + precision * away,
-        shared_cost=0.5 * float((precision * away**2).sum()),
-    )
-
-
-def solve_bias(model: LandmarkModel, frames: Frames, weights: Weights, state: State, bias_sd_m: float) -> State:
-    """Closed-form ridge update of the constant per-landmark offset [L, 3], everything else held."""
-    residual, scale, _, points = residuals(model, frames, weights, state)
-    _, influence = robust(residual, weights.robust_sigmas)
+def landmark_rows(model: LandmarkModel, frame: Frame, weights: Weights, lens: Camera, at: Posed) -> Rows:
+    """Distance between projected and detected landmarks, irises among them, in standard deviations."""
+    sigma = weights.landmark_sigma * frame.scale_px * model.group_sigma * np.sqrt(weights.correlated)
+    weight = frame.weight * facing(model.surface.normal, at.pose)
+    weight[model.pupil] *= weights.iris
+    scale = np.sqrt(weight) / sigma
+    residual = (camera.project(at.points, lens.focal_px, lens.centre_px) - frame.points) * scale[:, None]
+    cost, influence = huber(np.linalg.norm(residual, axis=1), weights.robust_sigmas)
     root = np.sqrt(influence)
-    jacobian = camera.project_jacobian(points, state.focal_px) @ state.rotation[:, None] * (scale * root)[..., None, None]
-    hessian = np.einsum("bkpi,bkpj->kij", jacobian, jacobian) + np.eye(3) / bias_sd_m**2
-    gradient = np.einsum("bkpi,bkp->ki", jacobian, residual * root[..., None]) + state.bias / bias_sd_m**2
-    bias = state.bias - np.linalg.solve(hessian, gradient[..., None])[..., 0]
-    bias[model.pupil] = 0.0  # a biased pupil would be a squint
-    return replace(state, bias=bias)
+    covector = camera.project_jacobian(at.points, lens.focal_px) * (scale * root)[:, None, None]
+    used = np.flatnonzero(scale > 0)
+    return Rows(
+        float(cost.sum()),
+        (residual * root[:, None])[used].ravel(),
+        ((covector[used].reshape(-1, 3), np.repeat(used, 2)),),
+    )
+
+
+def eyelid_rows(model: LandmarkModel, frame: Frame, weights: Weights, lens: Camera, at: Posed) -> Rows:
+    """Gap between upper and lower lid as seen against as detected: a blink moves few landmarks by little, so it gets its own term."""
+    upper, lower = model.lids[..., 0].ravel(), model.lids[..., 1].ravel()
+    seen = np.sqrt(frame.weight[upper] * frame.weight[lower] * facing(model.surface.normal[upper], at.pose))
+    scale = seen / (weights.eyelid_sigma * frame.scale_px)
+    pixel = camera.project(at.points, lens.focal_px, lens.centre_px)
+    gap = (pixel[upper] - pixel[lower]) - (frame.points[upper] - frame.points[lower])
+    residual = gap * scale[:, None]
+    cost, influence = huber(np.linalg.norm(residual, axis=1), weights.robust_sigmas)
+    root = (scale * np.sqrt(influence))[:, None, None]
+    rows = lambda points, sign: (  # noqa: E731
+        (sign * root * camera.project_jacobian(at.points[points], lens.focal_px)).reshape(-1, 3),
+        np.repeat(points, 2),
+    )
+    return Rows(float(cost.sum()), (residual * np.sqrt(influence)[:, None]).ravel(), (rows(upper, 1.0), rows(lower, -1.0)))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Priors of one frame's expression, gaze and jaw: quadratics, with soft walls at the ends of an action's range."""
+
+    mean: np.ndarray  # [d]
+    precision: np.ndarray  # [d, d] of everything but the walls; zero for rotation and translation
+    low: np.ndarray  # [d] lower wall, -inf where there is none
+    high: np.ndarray  # [d]
+    wall: np.ndarray  # [d] precision beyond a wall
+
+    def __call__(self, pose: Pose) -> tuple[float, np.ndarray, np.ndarray]:
+        """Cost, gradient [d] and Hessian [d, d]."""
+        value = np.concatenate([np.zeros(POSE), pose.expression, pose.gaze, pose.jaw])
+        away = value - self.mean
+        beyond = np.minimum(value - self.low, 0) + np.maximum(value - self.high, 0)
+        pull, push = self.precision @ away, self.wall * beyond
+        hessian = self.precision.copy()
+        hessian[np.diag_indices_from(hessian)] += self.wall * (beyond != 0)
+        return 0.5 * float(away @ pull + beyond @ push), pull + push, hessian
+
+
+def prior(model: LandmarkModel, frame: Frame, weights: Weights) -> Prior:
+    """The priors of one frame: expression about the blendshape scores, gaze straight ahead (held while an eye is shut), jaw shut."""
+    count = len(model.low)
+    size = POSE + count + GAZE + JAW
+    deviation = np.ones(size)
+    bounded = np.isfinite(model.low) | np.isfinite(model.high)
+    deviation[POSE : POSE + count] = np.where(bounded, weights.expression_sd, weights.statistical_sd)
+    shut = np.repeat(frame.open_eyes < 0.1, 2)
+    deviation[POSE + count : -JAW] = np.where(shut, weights.shut_gaze_sd_rad, weights.gaze_sd_rad)
+    deviation[-JAW:] = weights.jaw_sd_rad
+    precision = np.diag(1 / deviation**2)
+    precision[:POSE, :POSE] = 0.0
+    for left in (POSE + count, POSE + count + 1):  # both eyes look at the same thing
+        for row, column, sign in ((left, left, 1), (left + 2, left + 2, 1), (left, left + 2, -1), (left + 2, left, -1)):
+            precision[row, column] += sign / weights.vergence_sd_rad**2
+    mean, low, high, wall = np.zeros(size), np.full(size, -np.inf), np.full(size, np.inf), np.zeros(size)
+    mean[POSE : POSE + count] = frame.expression_mean
+    mean[POSE + count : -JAW] = np.where(shut, frame.gaze_mean, 0.0)
+    low[POSE : POSE + count], high[POSE : POSE + count] = model.low, model.high
+    wall[POSE : POSE + count] = 1 / weights.action_wall_sd**2
+    low[-JAW], wall[-JAW] = weights.jaw_wall_rad, 1 / np.radians(0.5) ** 2
+    return Prior(mean, precision, low, high, wall)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All terms of one frame: its cost and normal equations."""
+
+    terms: tuple[Term, ...]
+    prior: Callable[[Pose], tuple[float, np.ndarray, np.ndarray]]
+    free: np.ndarray  # [d] bool, unknowns that are solved for
+
+    def evaluate(self, pose: Pose) -> tuple[float, list[tuple[Posed, Rows]]]:
+        """Total robust cost and the terms' rows; one surface is posed once however many terms read it."""
+        done: dict[int, Posed] = {}
+        out = []
+        for term in self.terms:
+            if id(term.surface) not in done:
+                done[id(term.surface)] = posed(term.surface, pose)
+            at = done[id(term.surface)]
+            out.append((at, eliminated(term.rows(at))))
+        return self.prior(pose)[0] + sum(rows.cost for _, rows in out), out
+
+    def normal(self, pose: Pose, evaluated: list[tuple[Posed, Rows]]) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss-Newton Hessian [d, d] and gradient [d]; rows and columns of held unknowns are the identity and zero."""
+        _, gradient, hessian = self.prior(pose)
+        for at, rows in evaluated:
+            columns = row_jacobian(at, rows)
+            hessian = hessian + columns.T @ columns
+            gradient = gradient + columns.T @ rows.residual
+        held = ~self.free
+        hessian[held], hessian[:, held], gradient[held] = 0.0, 0.0, 0.0
+        hessian[held, held] = 1.0
+        return hessian, gradient
+
+    def gradient(self, pose: Pose, evaluated: list[tuple[Posed, Rows]]) -> np.ndarray:
+        """Gradient [d] of the cost alone; zero for held unknowns."""
+        total = self.prior(pose)[1]
+        for at, rows in evaluated:
+            total = total + row_jacobian(at, rows).T @ rows.residual
+        return np.where(self.free, total, 0.0)
+
+
+def eliminated(rows: Rows) -> Rows:
+    """Rows with their nuisance unknowns solved for: an orthonormal basis replaces the columns and the residual is projected.
+
+    The cost loses what the projection takes away (variable projection).
+    """
+    if rows.nuisance is None or not len(rows.residual):
+        return rows
+    basis, triangle = np.linalg.qr(rows.nuisance)
+    basis = basis[:, np.abs(np.diag(triangle)) > 1e-9 * max(1e-30, np.abs(triangle).max())]
+    amount = basis.T @ rows.residual
+    return replace(rows, residual=rows.residual - basis @ amount, nuisance=basis, cost=rows.cost - 0.5 * float(amount @ amount))
+
+
+def row_jacobian(at: Posed, rows: Rows) -> np.ndarray:
+    """Jacobian [M, d] of a term's rows, nuisance unknowns eliminated."""
+    columns = sum(jacobian(at, covector, point) for covector, point in rows.parts)
+    return columns if rows.nuisance is None else columns - rows.nuisance @ (rows.nuisance.T @ columns)
+
+
+def free_unknowns(model: LandmarkModel, pose_only: bool = False, actions: np.ndarray | None = None) -> np.ndarray:
+    """Which unknowns [d] are solved for: pose alone, or all that this head model has and the clip determines (actions [E])."""
+    count = len(model.low)
+    free = np.zeros(POSE + count + GAZE + JAW, bool)
+    free[:POSE] = True
+    if not pose_only:
+        free[POSE : POSE + count] = True if actions is None else actions
+        free[POSE + count : POSE + count + GAZE] = True
+        free[POSE + count + GAZE :] = model.jaw_moves
+    return free
+
+
+def landmark_problem(
+    model: LandmarkModel, frame: Frame, weights: Weights, lens: Camera, free: np.ndarray, extra: tuple[Term, ...] = ()
+) -> Problem:
+    """The landmark and eyelid terms and the priors of one frame, with further terms; the model's surface is folded."""
+    terms = (
+        Term(model.surface, lambda at: landmark_rows(model, frame, weights, lens, at)),
+        Term(model.surface, lambda at: eyelid_rows(model, frame, weights, lens, at)),
+    )
+    return Problem((*terms, *extra), prior(model, frame, weights), free)

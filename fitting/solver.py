@@ -12,6 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from fitting.energy import Problem
+from fitting.rig import Pose
+
 
 @dataclass
 class Normal:
@@ -54,6 +57,39 @@ def damped_solve(hessian: np.ndarray, right: np.ndarray, damping: float) -> np.n
     columns = right[..., None] if vector else right
     solved = np.linalg.solve(scaled, columns * scale[..., :, None]) * scale[..., :, None]
     return solved[..., 0] if vector else solved
+
+
+def solve_frame(
+    problem: Problem, pose: Pose, iterations: int, tolerance: float = 1e-4, damping: float = 1e-3
+) -> tuple[Pose, float, int]:
+    """Levenberg-Marquardt on one frame's unknowns.
+
+    Args:
+        iterations: at most this many linearisations; tolerance: stop when the relative decrease of the cost falls below it.
+
+    Returns:
+        pose, its cost, linearisations done.
+
+    Raises:
+        FloatingPointError: the cost at the start is not finite.
+    """
+    cost, evaluated = problem.evaluate(pose)
+    if not np.isfinite(cost):
+        raise FloatingPointError("the cost at the start of a frame's solve is not finite")
+    done = 0
+    for done in range(1, iterations + 1):  # noqa: B007
+        hessian, gradient = problem.normal(pose, evaluated)
+        before = cost
+        for _ in range(6):
+            trial = pose.moved(-damped_solve(hessian, gradient, damping))
+            new, trial_evaluated = problem.evaluate(trial)
+            if np.isfinite(new) and new < cost:
+                pose, cost, evaluated, damping = trial, new, trial_evaluated, max(damping / 5, 1e-9)
+                break
+            damping = min(damping * 8, 1e6)
+        if before - cost <= tolerance * before:
+            break
+    return pose, cost, done
 
 
 def step_of(normal: Normal, damping: float) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:

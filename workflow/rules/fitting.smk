@@ -98,7 +98,7 @@ rule split:
 
 rule fit:
     input:
-        head="resources/heads/anny.npz",
+        head=HEAD,
         frames="results/{subject}/frames/frames.npy",
         index="results/{subject}/frames/frames.json",
         landmarks="results/{subject}/landmarks/landmarks.npz",
@@ -122,7 +122,7 @@ rule fit:
 
 rule trim:
     input:
-        head="resources/heads/anny.npz",
+        head=HEAD,
         alpha="results/{subject}/matte/alpha.npy",
         track="results/{subject}/fit/track.npz",
     output:

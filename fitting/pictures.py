@@ -1,0 +1,151 @@
+"""The terms of the fit that read pixels: photometric samples and the silhouette of one frame, built around a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fitting import camera, photometric, silhouette
+from fitting.energy import Camera, Term
+from fitting.photometric import Appearance, Samples
+from fitting.rig import Pose, Rig, Surface, posed
+from fitting.state import State
+
+FINEST = len(photometric.LEVELS) - 1
+
+
+@dataclass(frozen=True)
+class Strength:
+    """How much the terms that read pixels count; 0 leaves one out."""
+
+    photometric: float  # of one sample against one landmark of standard deviation 1: neighbouring samples err together
+    photometric_robust: float  # Huber's threshold in standard deviations
+    silhouette: float  # of one point of the rim
+    silhouette_sigma: float  # of the matte's edge, in inter-ocular distances
+    silhouette_robust: float
+
+
+@dataclass(frozen=True)
+class Look:
+    """How the samples are seen in one frame."""
+
+    weight: np.ndarray  # [P] float32, 0 where hidden
+    shade: np.ndarray  # [P] float32 light on each sample
+    pixels: np.ndarray  # [P, 2] float32
+
+
+class Pictures:
+    """Frames and mattes of a clip with what was learned of them; makes terms.
+
+    `learn` must have run before `terms` gives photometric ones.
+    """
+
+    def __init__(self, rig: Rig, frames: np.ndarray, alpha: np.ndarray, scale_px: np.ndarray, strength: Strength, samples: int) -> None:
+        """
+        Args:
+            frames: [T, H, W, 3] uint8; alpha: [T, H, W] uint8, the person; scale_px: [T] inter-ocular distance; samples: P.
+        """
+        self.rig, self.frames, self.alpha, self.scale_px, self.strength = rig, frames, alpha, scale_px, strength
+        self.size = frames.shape[1:3]
+        self.whole = rig.vertices()
+        self.samples: Samples = photometric.choose_samples(rig, samples)
+        self.appearance: Appearance | None = None
+        self.skin: silhouette.Skin | None = None
+        self._folded: tuple[np.ndarray, Surface, Surface] | None = None
+
+    def fold(self, shape: np.ndarray) -> tuple[Surface, Surface]:
+        """All vertices and the samples, folded with one identity [S] (kept until another one is asked for)."""
+        if self._folded is None or not np.array_equal(self._folded[0], shape):
+            self._folded = (shape.copy(), self.whole.folded(shape), self.samples.surface.folded(shape))
+        return self._folded[1:]
+
+    def learn_skin(self, rows: Sequence[int], state: State, lens: Camera) -> None:
+        """Colour of the skin, from the photometric samples of some frames (state of these rows)."""
+        _, samples = self.fold(state.shape)
+        pixels = []
+        for k in range(len(rows)):
+            at = posed(samples, state.pose(k))
+            facing = photometric.weights_of(samples, state.pose(k), np.ones(len(at.points), bool)) > 0.2
+            pixels.append(camera.project(at.points[facing], lens.focal_px, lens.centre_px))
+        self.skin = silhouette.skin_of([self.frames[row] for row in rows], pixels)
+
+    def learn(self, rows: Sequence[int], state: State, lens: Camera, light: bool = True) -> Appearance:
+        """Albedo and light from training keyframes (state of these rows)."""
+        whole, samples = self.fold(state.shape)
+        pyramids, pixels, weights, normals = [], [], [], []
+        for k, row in enumerate(rows):
+            pose = state.pose(k)
+            at = posed(samples, pose)
+            seen = photometric.visible(whole, self.rig.triangles, pose, lens, self.size, at.points)
+            pixels.append(camera.project(at.points, lens.focal_px, lens.centre_px))
+            pyramids.append(photometric.pyramid(self.frames[row], pixels[-1], self.scale_px[row], range(FINEST + 1)))
+            weights.append(photometric.weights_of(samples, pose, seen))
+            normals.append(samples.normal @ pose.rotation.T)
+        self.appearance = photometric.learn(pyramids, np.stack(pixels), np.stack(weights), np.stack(normals), light)
+        return self.appearance
+
+    def silhouette_term(self, row: int, pose: Pose, shape: np.ndarray, lens: Camera) -> tuple[Term, Surface] | None:
+        """The silhouette term of one frame and its unfolded surface; None where the mesh's rim is not in the picture."""
+        edge = silhouette.edge_of(self.alpha[row])
+        whole, _ = self.fold(shape)
+        scale = self.scale_px[row]
+        rim = silhouette.rim_of(self.rig, whole, pose, lens, self.size, self.frames[row], edge, self.skin, scale)
+        if rim is None:
+            return None
+        strength = self.strength
+        term = silhouette.term_of(
+            rim, edge, shape, strength.silhouette_sigma * scale, strength.silhouette, lens, strength.silhouette_robust
+        )
+        return term, rim.surface
+
+    def silhouette_extra(self, rows: Sequence[int], state: State, centre_px: np.ndarray):
+        """Extra terms of the joint calibration (see `fitting.calibrate.refine`): the rim is found around `state`, then held."""
+        lens = state.lens(centre_px)
+        edges = [silhouette.edge_of(self.alpha[row]) for row in rows]
+        whole, _ = self.fold(state.shape)
+        rims = [
+            silhouette.rim_of(self.rig, whole, state.pose(k), lens, self.size, self.frames[row], edges[k], self.skin, self.scale_px[row])
+            for k, row in enumerate(rows)
+        ]
+
+        def extra(at: State, k: int) -> tuple[tuple[Term, Surface], ...]:
+            if rims[k] is None:
+                return ()
+            sigma = self.strength.silhouette_sigma * self.scale_px[rows[k]]
+            lens = at.lens(centre_px)
+            term = silhouette.term_of(
+                rims[k], edges[k], at.shape, sigma, self.strength.silhouette, lens, self.strength.silhouette_robust
+            )
+            return ((term, rims[k].surface),)
+
+        return extra
+
+    def look(self, row: int, pose: Pose, shape: np.ndarray, lens: Camera) -> Look:
+        """Visibility and shading of the samples around a pose: worked out once a frame, they change slowly."""
+        whole, samples = self.fold(shape)
+        at = posed(samples, pose)
+        seen = photometric.visible(whole, self.rig.triangles, pose, lens, self.size, at.points)
+        shade = np.clip(1 + photometric.harmonics(samples.normal @ pose.rotation.T) @ self.appearance.light, 0.3, None)
+        return Look(
+            photometric.weights_of(samples, pose, seen).astype(np.float32),
+            shade.astype(np.float32),
+            camera.project(at.points, lens.focal_px, lens.centre_px).astype(np.float32),
+        )
+
+    def photometric_terms(self, row: int, look: Look, shape: np.ndarray, lens: Camera, levels: Sequence[int]) -> list[Term]:
+        """The photometric term of one frame at some pyramid levels."""
+        _, samples = self.fold(shape)
+        pyramid = photometric.pyramid(self.frames[row], look.pixels, self.scale_px[row], levels)
+        strength, appearance = self.strength, self.appearance
+
+        def one(picture: photometric.Level, level: int) -> Term:
+            colour, sigma = appearance.albedo[level] * look.shade, appearance.sigma[level]
+            robust = strength.photometric_robust
+            return Term(
+                samples,
+                lambda at: photometric.photometric_rows(picture, colour, look.weight, sigma, strength.photometric, lens, robust, at),
+            )
+
+        return [one(picture, level) for picture, level in zip(pyramid, levels, strict=True)]
