@@ -17,6 +17,10 @@ ASSETS := face_landmarker.task selfie_segmentation.tflite lpips_alexnet.ckpt car
 
 .venv: .venv/installed
 
+.venv/tested: .venv/installed requirements-test.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements-test.txt
+	touch $@
+
 resources/assets/%: | .venv/installed
 	$(BIN)/python -m fitting.fetch --subject $* --config '{"path": null}' --output file=$@
 
@@ -35,7 +39,7 @@ lint: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/snakefmt --check --compact-diff Snakefile workflow
 
-test: lint $(ASSETS:%=resources/assets/%)
+test: lint .venv/tested $(ASSETS:%=resources/assets/%)
 	$(BIN)/python -m workflow.environment
 	$(BIN)/python -m pytest
 

@@ -18,6 +18,7 @@ include: "workflow/rules/export.smk"
 include: "workflow/rules/avatar.smk"
 include: "workflow/rules/report.smk"
 include: "workflow/rules/simulate.smk"
+include: "workflow/rules/tracking.smk"
 
 
 rule all:

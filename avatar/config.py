@@ -75,6 +75,10 @@ class PlotConfig(StepConfig):
     """plot: curves and comparisons as SVG."""
 
 
+class CompareConfig(StepConfig):
+    """compare: the table and the plot of the tracking benchmark. Nothing to set; it is no part of `config.yaml`."""
+
+
 class PageConfig(StepConfig):
     """page: one HTML page a subject."""
 
@@ -105,6 +109,8 @@ class Settings(BaseModel):
     split: fitting.SplitConfig = fitting.SplitConfig()
     fit: fitting.FitConfig = fitting.FitConfig()
     trim: fitting.TrimConfig = fitting.TrimConfig()
+    export: fitting.ExportConfig = fitting.ExportConfig()
+    simulate: fitting.SimulationConfig = fitting.SimulationConfig()
     variants: dict[str, VariantConfig] = Field({"demo": VariantConfig()}, description="Avatars to train per subject, by name.")
     evaluate: EvaluateConfig = EvaluateConfig()
     plot: PlotConfig = PlotConfig()

@@ -41,7 +41,8 @@ class Scene:
         self.focal_px, self.centre_px = float(values["focal_px"]), values["centre_px"].numpy().astype(np.float64)
         self.neutral_m = head.shaped(values["shape"])  # [V, 3]
         chosen = {name: values[name][self.frames] for name in ("expression", "rotation", "neck", "jaw", "eyes", "translation")}
-        matrix, offset = head.rigid(values["shape"], chosen["rotation"], chosen["neck"], chosen["translation"])
+        where = (chosen[name] for name in ("rotation", "neck", "translation", "expression"))
+        matrix, offset = head.rigid(values["shape"], *where)
         self.rotation, self.offset_m = matrix.double().numpy(), offset.double().numpy()
         vertices, displacement = [], []
         for start in range(0, len(self.frames), POSE_BLOCK):

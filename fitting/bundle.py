@@ -13,10 +13,11 @@ import numpy as np
 import scipy.linalg
 
 from fitting import camera
-from fitting.energy import Problem
+from fitting.energy import Problem, huber
 from fitting.rig import GAZE, JAW
 from fitting.state import State
 
+ROBUST_SIGMAS = 3.0  # accelerations beyond this pull no harder: a sudden move, a duplicated frame
 JUMP_DEGREES, JUMP_M = 15.0, 0.06  # a change from one frame to the next beyond this is a cut
 
 
@@ -35,7 +36,13 @@ class Smoothness:
         """One standard deviation per unknown [d]."""
         rotation, across, depth, expression, gaze, jaw = astuple(self)
         return np.concatenate(
-            [np.full(3, rotation), [across, across, depth], np.full(expressions, expression), np.full(GAZE, gaze), np.full(JAW, jaw)]
+            [
+                np.full(3, rotation),
+                [across, across, depth],
+                np.full(expressions, expression),
+                np.full(GAZE, gaze),
+                np.full(JAW, jaw),
+            ]
         )
 
 
@@ -49,9 +56,7 @@ def stencils(time_s: np.ndarray, cut: np.ndarray) -> np.ndarray:
     step = np.maximum(step, 0.25 * np.median(step)) if len(step) else step  # duplicated frames
     first, second = step[:-1], step[1:]
     unit = (1 / 30) ** 2
-    rows = np.stack(
-        [2 / (first * (first + second)), -2 / (first * second), 2 / (second * (first + second))], 1
-    ) * unit
+    rows = np.stack([2 / (first * (first + second)), -2 / (first * second), 2 / (second * (first + second))], 1) * unit
     return np.where((cut[1:-1] | cut[2:])[:, None], 0.0, rows)
 
 
@@ -96,6 +101,12 @@ def smooth(
         return state, []
     precision = 1 / deviation**2
 
+    def bends(at: State) -> tuple[float, np.ndarray, np.ndarray]:
+        """Robust cost of the accelerations, themselves [T - 2, d] and their precision [T - 2, d]."""
+        bend = acceleration(at, stencil)
+        size, influence = huber(np.abs(bend) / deviation, ROBUST_SIGMAS)
+        return float(size.sum()), bend, influence * precision
+
     def measure(at: State) -> tuple[float, np.ndarray, np.ndarray]:
         hessian, gradient, total = np.zeros((count, unknowns, unknowns)), np.zeros((count, unknowns)), 0.0
         for k in range(count):
@@ -106,12 +117,12 @@ def smooth(
             cost, evaluated = problem.evaluate(at.pose(k))
             hessian[k], gradient[k] = problem.normal(at.pose(k), evaluated)
             total += cost
-        return total + 0.5 * float((acceleration(at, stencil) ** 2 * precision).sum()), hessian, gradient
+        return total + bends(at)[0], hessian, gradient
 
     cost, hessian, gradient = measure(state)
     costs = [cost]
     for _ in range(iterations):
-        step = _solve(hessian, gradient, acceleration(state, stencil), stencil, precision)
+        step = _solve(hessian, gradient, *bends(state)[1:], stencil)
         for _ in range(3):
             trial = state.with_poses([state.pose(k).moved(step[k]) for k in range(count)])
             new, trial_hessian, trial_gradient = measure(trial)
@@ -128,8 +139,8 @@ def smooth(
     return state, costs
 
 
-def _solve(hessian: np.ndarray, gradient: np.ndarray, bend: np.ndarray, stencil: np.ndarray, precision: np.ndarray) -> np.ndarray:
-    """Gauss-Newton step [T, d] of frames and accelerations together (banded Cholesky, Jacobi-scaled)."""
+def _solve(hessian: np.ndarray, gradient: np.ndarray, bend: np.ndarray, precision: np.ndarray, stencil: np.ndarray) -> np.ndarray:
+    """Gauss-Newton step [T, d] of frames and accelerations [T - 2, d] together (banded Cholesky, Jacobi-scaled)."""
     count, unknowns = gradient.shape
     total, right = hessian.copy(), gradient.copy()
     diagonal = np.arange(unknowns)
@@ -155,5 +166,3 @@ def _solve(hessian: np.ndarray, gradient: np.ndarray, bend: np.ndarray, stencil:
     band[unknowns, : (count - 1) * unknowns] = near[:-1].ravel() * flat[unknowns:] * flat[:-unknowns]
     band[2 * unknowns, : (count - 2) * unknowns] = far[:-2].ravel() * flat[2 * unknowns :] * flat[: -2 * unknowns]
     return -(scipy.linalg.solveh_banded(band, right.ravel() * flat, lower=True) * flat).reshape(count, unknowns)
-
-

@@ -30,6 +30,9 @@ class HeadConfig(StepConfig):
         None, ge=10, le=300, description="Components of identity that are kept; null: 80 of anny, 100 of flame."
     )
     samples: int = Field(600, ge=100, le=5000, description="anny: random heads from which the identity space is computed.")
+    renders: int = Field(
+        800, ge=50, le=10000, description="Random heads that are rendered to learn how the detector's landmarks slide over them."
+    )
     path: str | None = Field(
         None,
         validate_default=True,
@@ -139,11 +142,9 @@ class ExportConfig(StepConfig):
     )
 
 
-class SimulateConfig(StepConfig):
-    """simulate: a selfie video with a known head, camera and light, to measure a fit against."""
+class SimulationConfig(StepConfig):
+    """simulate: selfie videos with a known head, camera and light, to measure a fit against (made when asked for)."""
 
-    kind: Literal["still", "slow", "fast", "jump", "profile", "blink", "talk"] = Field("slow", description="How the head moves.")
-    seed: int = Field(0, ge=0, description="Who it is, and every other random choice.")
     frames: int = Field(300, ge=1, le=5000, description="Frames of the video.")
     fps: float = Field(30.0, gt=0, le=240, description="Frames a second.")
     height: int = Field(512, ge=64, le=2160, multiple_of=2, description="Height of the video in pixels.")
@@ -156,3 +157,18 @@ class SimulateConfig(StepConfig):
     noise: float = Field(0.006, ge=0, le=0.1, description="Standard deviation of the sensor noise, part of full scale.")
     displacement_mm: float = Field(0.7, ge=0, le=5, description="Rms displacement (mm) of the skin that no identity basis holds.")
     bump_mm: float = Field(1.5, ge=0, le=5, description="Height (mm) of expression bumps that no expression basis holds.")
+
+
+class SimulateConfig(SimulationConfig):
+    """simulate: as above, with what the name of the video says: `{kind}_{seed}.mp4`."""
+
+    kind: Literal["still", "slow", "fast", "jump", "profile", "blink", "talk"] = Field("slow", description="How the head moves.")
+    seed: int = Field(0, ge=0, description="Who it is, and every other random choice.")
+
+
+class BenchmarkConfig(StepConfig):
+    """benchmark: one fit of one clip, timed and compared. The rule fills this in; it is no part of `config.yaml`."""
+
+    fit: FitConfig = Field(FitConfig(), description="The fit.")
+    frames: int | None = Field(None, ge=8, description="At most this many frames, about the split; null takes all.")
+    simulated: bool = Field(False, description="Whether the clip is a simulated one.")

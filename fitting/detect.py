@@ -25,8 +25,10 @@ def run(job: step.Job) -> None:
     frames = np.load(job.input.frames, mmap_mode="r")
     times = step.read_json(job.input.index)["time_s"]
     if len(times) != len(frames):
-        raise step.StepError(f"{job.input.frames}: {len(frames)} frames but {len(times)} times in {job.input.index}; delete both "
-                             f"and run snakemake again")
+        raise step.StepError(
+            f"{job.input.frames}: {len(frames)} frames but {len(times)} times in {job.input.index}; delete both "
+            f"and run snakemake again"
+        )
     kept: list[Face | None] = []
     switched = np.zeros(len(frames), dtype=bool)
     most, recovered, track = 0, 0, FaceTrack()
@@ -44,18 +46,36 @@ def run(job: step.Job) -> None:
     found = np.array([face is not None for face in kept])
     if not found.any():
         raise step.StepError(f"{job.input.frames}: no face in any of {len(frames)} frames; check the crop in probe.json")
-    nothing = Face(np.full((POINTS, 3), np.nan, np.float32), np.full(len(BLENDSHAPE_NAMES), np.nan, np.float32),
-                   np.full((4, 4), np.nan, np.float32))
+    nothing = Face(
+        np.full((POINTS, 3), np.nan, np.float32),
+        np.full(len(BLENDSHAPE_NAMES), np.nan, np.float32),
+        np.full((4, 4), np.nan, np.float32),
+    )
     rows = [face or nothing for face in kept]
     with open(job.output.landmarks, "wb") as file:
-        np.savez(file, points=np.stack([row.points for row in rows]), found=found,
-                 blendshapes=np.stack([row.blendshapes for row in rows]), blendshape_names=np.array(BLENDSHAPE_NAMES),
-                 head_pose=np.stack([row.head_pose for row in rows]), switched=switched)
+        np.savez(
+            file,
+            points=np.stack([row.points for row in rows]),
+            found=found,
+            blendshapes=np.stack([row.blendshapes for row in rows]),
+            blendshape_names=np.array(BLENDSHAPE_NAMES),
+            head_pose=np.stack([row.head_pose for row in rows]),
+            switched=switched,
+        )
     milliseconds = 1e3 * job.seconds() / len(frames)
-    job.write_json(job.output.report, {
-        "frames": len(frames), "found": int(found.sum()), "found_fraction": float(found.mean()),
-        "lost_frames": np.flatnonzero(~found).tolist(), "switched_frames": np.flatnonzero(switched).tolist(),
-        "found_again_by_still_detection": recovered, "faces_max": most, "ms_per_frame": round(milliseconds, 2)})
+    job.write_json(
+        job.output.report,
+        {
+            "frames": len(frames),
+            "found": int(found.sum()),
+            "found_fraction": float(found.mean()),
+            "lost_frames": np.flatnonzero(~found).tolist(),
+            "switched_frames": np.flatnonzero(switched).tolist(),
+            "found_again_by_still_detection": recovered,
+            "faces_max": most,
+            "ms_per_frame": round(milliseconds, 2),
+        },
+    )
     job.log.info("a face in %d of %d frames, %d switches, %.1f ms each", found.sum(), len(frames), switched.sum(), milliseconds)
 
 

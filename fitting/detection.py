@@ -67,9 +67,15 @@ class FaceFinder:
             RuntimeError, ValueError: the model is not one that MediaPipe reads.
         """
         self._video = video
-        self._task = FaceLandmarker.create_from_options(FaceLandmarkerOptions(
-            base_options=BaseOptions(model_asset_buffer=model), running_mode=RunningMode.VIDEO if video else RunningMode.IMAGE,
-            num_faces=max_faces, output_face_blendshapes=True, output_facial_transformation_matrixes=True))
+        self._task = FaceLandmarker.create_from_options(
+            FaceLandmarkerOptions(
+                base_options=BaseOptions(model_asset_buffer=model),
+                running_mode=RunningMode.VIDEO if video else RunningMode.IMAGE,
+                num_faces=max_faces,
+                output_face_blendshapes=True,
+                output_facial_transformation_matrixes=True,
+            )
+        )
 
     def __enter__(self) -> FaceFinder:
         return self
@@ -96,10 +102,13 @@ class FaceFinder:
             found.face_landmarks, found.face_blendshapes, found.facial_transformation_matrixes, strict=True
         ):
             named = {score.category_name: score.score for score in scores}
-            faces.append(Face(
-                np.array([(point.x, point.y, point.z) for point in points], dtype=np.float32) * scale + offset,
-                np.array([named[name] for name in BLENDSHAPE_NAMES], dtype=np.float32),
-                np.asarray(matrix, dtype=np.float32)))
+            faces.append(
+                Face(
+                    np.array([(point.x, point.y, point.z) for point in points], dtype=np.float32) * scale + offset,
+                    np.array([named[name] for name in BLENDSHAPE_NAMES], dtype=np.float32),
+                    np.asarray(matrix, dtype=np.float32),
+                )
+            )
         return faces
 
 
@@ -186,8 +195,11 @@ class FaceTrack:
             self._keep(faces[best], time_s, moved=True)
             return best, False
         resized = abs(math.log(faces[best].size_px / self._last.size_px))
-        same_person = len(faces) == 1 and resized < self.growth and shape_difference(
-            faces[best].points, self._last.points) < self.same_shape
+        same_person = (
+            len(faces) == 1
+            and resized < self.growth
+            and shape_difference(faces[best].points, self._last.points) < self.same_shape
+        )
         if same_person or gap_s > self.forget_s:
             self._keep(faces[best], time_s, moved=False)
             return best, True

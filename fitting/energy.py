@@ -165,7 +165,9 @@ def prior(model: LandmarkModel, frame: Frame, weights: Weights) -> Prior:
             precision[row, column] += sign / weights.vergence_sd_rad**2
     mean, low, high, wall = np.zeros(size), np.full(size, -np.inf), np.full(size, np.inf), np.zeros(size)
     mean[POSE : POSE + count] = frame.expression_mean
-    mean[POSE + count : -JAW] = np.where(shut, frame.gaze_mean, 0.0)
+    eyes = slice(POSE + count, POSE + count + GAZE)
+    held = np.where(shut, frame.gaze_mean, 0.0) / deviation[eyes] ** 2
+    mean[eyes] = np.linalg.solve(precision[eyes, eyes], held)  # vergence compares the angles, not their distances to a mean
     low[POSE : POSE + count], high[POSE : POSE + count] = model.low, model.high
     wall[POSE : POSE + count] = 1 / weights.action_wall_sd**2
     low[-JAW], wall[-JAW] = weights.jaw_wall_rad, 1 / np.radians(0.5) ** 2

@@ -62,7 +62,7 @@ def run(job: step.Job) -> None:
     flame = verify_export.Flame.of(head)
     try:
         checked = {
-            "nha": {"file": _check_nha(job, head, flame, _limited(plain, pose))},
+            "nha": {"file": _check_nha(job, head, flame, _limited(head, plain, pose))},
             "vhap": {
                 "tracked": _check_vhap(job, head, flame, plain, canvas, float(np.linalg.norm(off_centre))),
                 "folder": _check_folder(job, head, flame, plain, canvas),
@@ -90,11 +90,10 @@ def _read_track(job: step.Job, head: HeadModel) -> dict[str, np.ndarray]:
 
 
 def _limited(
-    track: dict[str, np.ndarray], pose: FlamePose, parts: Iterable[str] = export_nha.LIMITS_DEG
+    head: HeadModel, track: dict[str, np.ndarray], pose: FlamePose, parts: Iterable[str] = export_nha.LIMITS_DEG
 ) -> dict[str, np.ndarray]:
-    """The track with some joints moved inside NHA's limits, in the project's own axes."""
-    inside = export_nha.limited(pose, tuple(parts))
-    return track | {part: getattr(inside, part) @ export_pose.FLIP for part in parts}
+    """The track with some joints moved inside NHA's limits, in the project's own axes and order."""
+    return track | export_pose.own(head, export_nha.limited(pose, tuple(parts)))
 
 
 def _write_folder(
@@ -215,7 +214,7 @@ def _report(
     """export.json: what was written, what it cannot hold, how well what is written was read back."""
     plain = export_pose.without_eyelids(head, track)
     eyelids = _loss(head, track, plain, ["expression"])
-    limits = {part: _loss(head, plain, _limited(plain, pose, [part]), [part]) for part in export_nha.LIMITS_DEG}
+    limits = {part: _loss(head, plain, _limited(head, plain, pose, [part]), [part]) for part in export_nha.LIMITS_DEG}
     found = head.version or "unnamed"
     codes = lambda name: {"expects": f"FLAME {EXPECTED[name]}", "found": found, "same": EXPECTED[name] == found}  # noqa: E731
     usable = track["usable"]

@@ -28,8 +28,8 @@ class FlamePose:
     shape: np.ndarray  # [300] standard deviations, zero beyond the fitted ones
     expression: np.ndarray  # [T, 100], eyelid coefficients dropped, zero beyond the fitted ones
     neck: np.ndarray  # [T, 3] rad, axis-angle, FLAME's axes
-    jaw: np.ndarray  # [T, 3] rad
-    eyes: np.ndarray  # [T, 2, 3] rad, joints 3 and 4: the left eye, the right eye
+    jaw: np.ndarray  # [T, 3] rad, joint 2 of the model file
+    eyes: np.ndarray  # [T, 2, 3] rad, joints 3 and 4 of the model file: the left and the right eye, in most files in this order
     rotation: np.ndarray  # [T, 3, 3] of the head in camera axes (OpenCV), identity when frontal
     offset: np.ndarray  # [T, 3] m: a head point x of a straight neck lies at `rotation x + offset`
     root: np.ndarray  # [T, 3] m, FLAME's root joint in the project's axes: it moves with shape and expression
@@ -75,17 +75,30 @@ def of_track(head: HeadModel, track: Mapping[str, np.ndarray]) -> FlamePose:
     shape, expression = np.asarray(track["shape"], np.float64), np.asarray(track["expression"], np.float64)
     beta, psi = _tensor(head, shape), _tensor(head, np.where(lid, 0.0, expression))
     turn, move = _tensor(head, track["rotation"]), _tensor(head, track["translation"])
+    jaw, eyes = _file_order(head, np.asarray(track["jaw"], np.float64), np.asarray(track["eyes"], np.float64))
     rotation, offset = head.rigid(beta, turn, torch.zeros_like(turn), move, psi)
     return FlamePose(
         shape=np.pad(shape, (0, SHAPES - len(shape))),
         expression=np.pad(expression[:, ~lid], ((0, 0), (0, EXPRESSIONS - (~lid).sum()))),
         neck=np.asarray(track["neck"], np.float64) @ FLIP,
-        jaw=np.asarray(track["jaw"], np.float64) @ FLIP,
-        eyes=np.asarray(track["eyes"], np.float64) @ FLIP,
+        jaw=jaw @ FLIP,
+        eyes=eyes @ FLIP,
         rotation=rotation.numpy(),
         offset=offset.numpy(),
         root=head.joints_of(beta, psi)[:, 0].numpy(),
     )
+
+
+def own(head: HeadModel, pose: FlamePose) -> dict[str, np.ndarray]:
+    """The way back: neck, jaw and eyes of a pose in FLAME's terms as a track holds them."""
+    joints = np.concatenate([pose.jaw[:, None], pose.eyes], 1)[:, head.source_joints.numpy()[2:] - 2]
+    return {"neck": pose.neck @ FLIP, "jaw": joints[:, 0] @ FLIP, "eyes": joints[:, 1:] @ FLIP}
+
+
+def _file_order(head: HeadModel, jaw: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations of the model file's joints 2 [T, 3] and 3, 4 [T, 2, 3], which other programs take for jaw and eyes."""
+    joints = np.concatenate([jaw[:, None], eyes], 1)[:, np.argsort(head.source_joints.numpy()[2:])]
+    return joints[:, 0], joints[:, 1:]
 
 
 def _tensor(head: HeadModel, values: np.ndarray) -> Tensor:

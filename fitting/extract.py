@@ -69,21 +69,35 @@ def run(job: step.Job) -> None:
         for frame in job.progress(video.read_frames(path, job.threads), "extract", wanted):
             rgb = frame.rgb()
             if rgb.shape[:2] != source_size:
-                raise step.StepError(f"{path}: frame {frame.index} is {rgb.shape[1]}x{rgb.shape[0]} but probe saw "
-                                     f"{source_size[1]}x{source_size[0]}; the file has changed, run snakemake again")
+                raise step.StepError(
+                    f"{path}: frame {frame.index} is {rgb.shape[1]}x{rgb.shape[0]} but probe saw "
+                    f"{source_size[1]}x{source_size[0]}; the file has changed, run snakemake again"
+                )
             frames.append(cut(rgb, crop, size))
             times.append(round(frame.time_s, 6))
             numbers.append(frame.index)
             if len(times) == wanted:
                 break
     if len(times) < (1.0 - MISSING_FRACTION) * wanted:
-        raise step.StepError(f"{path}: {len(times)} frames decode but probe counted {wanted}; the file has changed or is "
-                             f"damaged, copy it anew and run snakemake again")
-    job.write_json(job.output.index, {
-        "fps": probe["fps"], "time_s": times, "source_frame": numbers, "crop": crop, "scale": scale, "size": list(size),
-        "source_size": list(source_size)})
-    job.log.info("%d frames of %dx%d at scale %.3f, %.1f ms each", len(times), size[1], size[0], scale,
-                 1e3 * job.seconds() / len(times))
+        raise step.StepError(
+            f"{path}: {len(times)} frames decode but probe counted {wanted}; the file has changed or is "
+            f"damaged, copy it anew and run snakemake again"
+        )
+    job.write_json(
+        job.output.index,
+        {
+            "fps": probe["fps"],
+            "time_s": times,
+            "source_frame": numbers,
+            "crop": crop,
+            "scale": scale,
+            "size": list(size),
+            "source_size": list(source_size),
+        },
+    )
+    job.log.info(
+        "%d frames of %dx%d at scale %.3f, %.1f ms each", len(times), size[1], size[0], scale, 1e3 * job.seconds() / len(times)
+    )
 
 
 if __name__ == "__main__":

@@ -110,8 +110,10 @@ def verify(path: Path, asset: Asset, source: str) -> None:
     """
     found = assets.sha256_of(path)
     if found != asset.sha256:
-        raise step.StepError(f"{source}: sha256 of {asset.name} is {found} but must be {asset.sha256}; replace that file, "
-                             f"or name a good copy in config/config.yaml under assets: {{{asset.name}: PATH}}")
+        raise step.StepError(
+            f"{source}: sha256 of {asset.name} is {found} but must be {asset.sha256}; replace that file, "
+            f"or name a good copy in config/config.yaml under assets: {{{asset.name}: PATH}}"
+        )
 
 
 def from_index(asset: Asset, target: Path, log) -> list[str]:
@@ -145,8 +147,10 @@ def run(job: step.Job) -> None:
     if job.config.path is not None:
         own = Path(job.config.path).expanduser()
         if not own.is_file():
-            raise step.StepError(f"{own}: named in config as asset {asset.name}, but there is no such file; correct the path "
-                                 f"under assets: or remove the entry to have it fetched")
+            raise step.StepError(
+                f"{own}: named in config as asset {asset.name}, but there is no such file; correct the path "
+                f"under assets: or remove the entry to have it fetched"
+            )
         verify(own, asset, str(own))
         shutil.copyfile(own, target)
         return
@@ -162,8 +166,10 @@ def run(job: step.Job) -> None:
     failed = from_index(asset, target, job.log)
     if failed:
         target.unlink(missing_ok=True)
-        raise step.StepError(f"{asset.name}: not here and not fetched ({'; '.join(reasons + failed)}); connect to the "
-                             f"network, or name your own copy in config/config.yaml under assets: {{{asset.name}: PATH}}")
+        raise step.StepError(
+            f"{asset.name}: not here and not fetched ({'; '.join(reasons + failed)}); connect to the "
+            f"network, or name your own copy in config/config.yaml under assets: {{{asset.name}: PATH}}"
+        )
 
 
 if __name__ == "__main__":

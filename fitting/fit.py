@@ -54,7 +54,7 @@ def read_clip(job: step.Job, head: HeadModel) -> tracking.Clip:
         StepError: landmarks and frames do not belong together.
     """
     rig = Rig(head)
-    model = LandmarkModel.of(rig, head.landmark_triangles.numpy(), head.landmark_barycentric.numpy())
+    model = landmark_model(rig, head)
     index, split = step.read_json(job.input.index), step.read_json(job.input.split)
     with np.load(job.input.landmarks, allow_pickle=False) as file:
         seen = {name: file[name] for name in ("points", "found", "blendshapes", "blendshape_names")}
@@ -84,6 +84,12 @@ def read_clip(job: step.Job, head: HeadModel) -> tracking.Clip:
         np.array(split["test"], int),
         float(np.log(focal)),
     )
+
+
+def landmark_model(rig: Rig, head: HeadModel) -> LandmarkModel:
+    """The head model's landmarks with the detector's habits in them."""
+    names = ("landmark_triangles", "landmark_barycentric", "landmark_slide", "landmark_sigma")
+    return LandmarkModel.of(rig, *(getattr(head, name).numpy() for name in names))
 
 
 def track_arrays(head: HeadModel, clip: tracking.Clip, fitted: tracking.Fitted) -> dict[str, np.ndarray]:

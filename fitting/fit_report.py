@@ -18,7 +18,7 @@ def report(head: HeadModel, clip: Clip, fitted: Fitted, config: FitConfig) -> di
     scale = clip.observed.scale_px
     yaw, pitch = np.degrees(camera.log_rotation(state.rotation[usable])[:, :2].T[::-1])
     held = fitted.held_out_px / scale
-    tracked = sum(fitted.seconds.get(name, 0.0) for name in ("track", "photometric", "bundle"))
+    tracked = sum(fitted.seconds.get(name, 0.0) for name in ("track", "pixels", "bundle"))
     return {
         "frames": len(usable),
         "usable": int(usable.sum()),

@@ -4,7 +4,8 @@ FLAME is not shipped and its loader is not copied: the equations are SMPL's, whi
 What is done to them, and why:
 - axes become ours (FLAME: y up, face along +z), a half turn about x; FLAME's origin is kept, so that its parameters are ours
   with the signs of y and z changed;
-- which eye joint is the left one is decided by the eyeball that it moves, for names in the wild disagree;
+- which eye joint is the left one is decided by the eyeball that it moves, for names in the wild disagree; exporters need the
+  file's own order, so it is kept (`source_joints`);
 - joints follow shape and expression, as J_regressor says;
 - the jaw of a `no_jaw` file is locked: its weights go to the neck, whose motion it then shares;
 - FLAME's components close the eyes poorly: two are added, `eyelid_left` and `eyelid_right`, from 0 (open) to 1 (closed).
@@ -172,6 +173,7 @@ def bake(
         digest="",
         source=source,
         version=version,
+        source_joints=torch.tensor(order),
     )
     return mouth_cavity.add(head) if cavity else head
 

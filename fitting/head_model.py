@@ -46,11 +46,21 @@ class HeadModel:
     joint_expression_basis: Tensor | None = None  # [E, 5, 3] m per unit; None becomes zeros (joints that expressions leave alone)
     source: str = ""  # what it was baked from: sha256 of the user's file, or package and version
     version: str = ""  # of the source model, such as "2023 Open"
+    landmark_slide: Tensor | None = None  # [L, 3, 1 + S + 2] m, the detector's habits (`fitting.habits`); None becomes zeros
+    landmark_sigma: Tensor | None = None  # [L] m, what they leave unexplained; None becomes NaN: not known
+    source_joints: Tensor | None = None  # [5] int64, number in the source file of each joint; None becomes 0, 1, 2, 3, 4
 
     def __post_init__(self) -> None:
         if self.joint_expression_basis is None:
             zeros = self.expression_basis.new_zeros(len(self.expression_basis), len(JOINTS), 3)
             object.__setattr__(self, "joint_expression_basis", zeros)
+        if self.landmark_slide is None:
+            features = 1 + len(self.shape_basis) + 2
+            object.__setattr__(self, "landmark_slide", self.template.new_zeros(len(self.landmark_triangles), 3, features))
+        if self.landmark_sigma is None:
+            object.__setattr__(self, "landmark_sigma", self.template.new_full((len(self.landmark_triangles),), float("nan")))
+        if self.source_joints is None:
+            object.__setattr__(self, "source_joints", torch.arange(len(JOINTS)))
 
     @staticmethod
     def load(path: Path | str, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> HeadModel:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ NOSE = (168, 6, 197, 195, 5, 4, 1, 2, 98, 97, 326, 327, 129, 358)
 OUTER_EYE_CORNERS = (33, 263)
 IRIS_RINGS = ((473, 474, 475, 476, 477), (468, 469, 470, 471, 472))  # left, right eye: centre and ring
 LID_PAIRS = (((386, 374), (385, 380), (387, 373)), ((159, 145), (158, 153), (160, 144)))  # left, right eye: upper and lower lid
+UNIT_SIGMA = 0.012  # of the inter-ocular distance: what a relative standard deviation of 1 means
 EYE_CORNERS = ((263, 362), (33, 133))  # left, right eye
 
 
@@ -38,8 +39,18 @@ class LandmarkModel:
     jaw_moves: bool
 
     @staticmethod
-    def of(rig: Rig, landmark_triangles: np.ndarray, landmark_barycentric: np.ndarray) -> LandmarkModel:
+    def of(
+        rig: Rig,
+        landmark_triangles: np.ndarray,
+        landmark_barycentric: np.ndarray,
+        slide: np.ndarray | None = None,
+        sigma_m: np.ndarray | None = None,
+    ) -> LandmarkModel:
         """Landmarks of the head model's embedding [478], [478, 3]; those without a place (-1) are left out.
+
+        Args:
+            slide: [478, 3, 1 + S + 2] m, sigma_m: [478], the detector's habits (`fitting.habits`); None: fixed points and
+                standard deviations by group.
 
         Raises:
             ValueError: a pupil or a lid landmark has no place on this head model.
@@ -52,9 +63,17 @@ class LandmarkModel:
         sigma = np.full(len(ids), 2.0)
         for group, value in ((BROWS, 1.8), (NOSE, 0.8), (LIPS, 0.9), (EYES, 0.8), ((LEFT_IRIS, RIGHT_IRIS), 0.5)):
             sigma[np.isin(ids, group)] = value
+        if sigma_m is not None:
+            corners = landmark_triangles[list(OUTER_EYE_CORNERS)], landmark_barycentric[list(OUTER_EYE_CORNERS)]
+            first, second = rig.surface(*corners).base
+            known = np.isfinite(sigma_m[ids])
+            sigma[known] = sigma_m[ids][known] / (UNIT_SIGMA * np.linalg.norm(first - second))
+        surface = rig.surface(landmark_triangles[ids], landmark_barycentric[ids].astype(np.float64))
+        if slide is not None:
+            surface = _sliding(surface, slide[ids].astype(np.float64))
         return LandmarkModel(
             ids,
-            rig.surface(landmark_triangles[ids], landmark_barycentric[ids].astype(np.float64)),
+            surface,
             np.array([row[LEFT_IRIS], row[RIGHT_IRIS]]),
             np.vectorize(row.get)(np.array(LID_PAIRS)),
             sigma,
@@ -62,3 +81,13 @@ class LandmarkModel:
             rig.high,
             rig.jaw_moves,
         )
+
+
+def _sliding(surface: Surface, slide: np.ndarray) -> Surface:
+    """A surface whose points wander with identity and view as the detector's do; slide [L, 3, 1 + S + 2] m."""
+    return replace(
+        surface,
+        base=surface.base + slide[..., 0],
+        shape_basis=np.ascontiguousarray(surface.shape_basis + slide[..., 1:-2]),
+        view_basis=np.ascontiguousarray(slide[..., -2:]),
+    )

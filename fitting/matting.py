@@ -44,8 +44,11 @@ class PersonSegmenter:
         Raises:
             RuntimeError, ValueError: the model is not one that MediaPipe reads.
         """
-        self._task = ImageSegmenter.create_from_options(ImageSegmenterOptions(
-            base_options=BaseOptions(model_asset_buffer=model), running_mode=RunningMode.IMAGE, output_confidence_masks=True))
+        self._task = ImageSegmenter.create_from_options(
+            ImageSegmenterOptions(
+                base_options=BaseOptions(model_asset_buffer=model), running_mode=RunningMode.IMAGE, output_confidence_masks=True
+            )
+        )
 
     def __enter__(self) -> PersonSegmenter:
         return self
@@ -193,8 +196,10 @@ def place_between_colours(
         Opacity (N,) in [0, 1], and how far to trust it (N,): near 1 where the colours are far apart and each is uniform.
     """
     small, mask = half(rgb).astype(np.float32) / 255.0, half(confidence)
-    near = (np.minimum(rows * mask.shape[0] // confidence.shape[0], mask.shape[0] - 1),
-            np.minimum(columns * mask.shape[1] // confidence.shape[1], mask.shape[1] - 1))
+    near = (
+        np.minimum(rows * mask.shape[0] // confidence.shape[0], mask.shape[0] - 1),
+        np.minimum(columns * mask.shape[1] // confidence.shape[1], mask.shape[1] - 1),
+    )
     window = (2 * max(1, radius // 2) + 1,) * 2
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(1, radius // 8) + 1,) * 2)
     means, spread, supported = [], np.float32(0.0), True
@@ -204,8 +209,9 @@ def place_between_colours(
         count = cv2.blur(weight.astype(np.float32), window)[near]
         safe = np.maximum(count, 1e-6)
         means.append(cv2.blur(chosen, window)[near] / safe[:, None])
-        spread = spread + np.maximum(cv2.sqrBoxFilter(chosen, cv2.CV_32F, window)[near].sum(axis=1) / safe
-                                     - (means[-1] ** 2).sum(axis=1), 0.0)
+        spread = spread + np.maximum(
+            cv2.sqrBoxFilter(chosen, cv2.CV_32F, window)[near].sum(axis=1) / safe - (means[-1] ** 2).sum(axis=1), 0.0
+        )
         supported = supported & (count > 1e-3)
     line = means[0] - means[1]
     separation = (line**2).sum(axis=1)

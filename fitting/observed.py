@@ -56,26 +56,46 @@ def observe(
     points = np.where(found[:, None, None], points, 0.0).astype(np.float64)
     for ring in IRIS_RINGS:
         points[:, ring[0]] = points[:, list(ring)].mean(1)
-    corners = points[:, list(OUTER_EYE_CORNERS)]
-    scale = np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)  # with depth: does not shrink with yaw
+    within = ((points[..., :2] > 1) & (points[..., :2] < np.array(size[::-1]) - 1)).all(-1)
+    scale = _interocular(points, within)
     found &= scale > 2.0
-    chosen = points[:, model.ids, :2]
-    inside = ((chosen > 1) & (chosen < np.array(size[::-1]) - 1)).all(-1)
+    chosen, inside = points[:, model.ids, :2], within[:, model.ids]
     found &= inside.mean(1) > 0.5
     names = list(blendshape_names)
     score = np.stack([blendshapes[:, names.index(n)] if n in names else np.zeros(len(found)) for n in expression_names], 1)
     score = np.where(found[:, None] & np.isfinite(score), score, 0.0)
-    return Observed(
-        chosen, found, np.where(found, scale, 1.0), score, inside, _open(points), np.asarray(centre_px, np.float64)
-    )
+    return Observed(chosen, found, np.where(found, scale, 1.0), score, inside, _open(points), np.asarray(centre_px, np.float64))
+
+
+def _interocular(points: np.ndarray, within: np.ndarray) -> np.ndarray:
+    """Distance [T] px of the outer eye corners, with depth, so that it does not shrink with yaw.
+
+    A detector may clamp what lies outside the picture, so a frame without both corners takes the nearest frame's that has them.
+    """
+    corners = points[:, list(OUTER_EYE_CORNERS)]
+    scale = np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)
+    seen = np.flatnonzero(within[:, list(OUTER_EYE_CORNERS)].all(1) & (scale > 2.0))
+    if not len(seen):
+        return scale
+    right = np.searchsorted(seen, np.arange(len(scale))).clip(0, len(seen) - 1)
+    left = (right - 1).clip(0)
+    nearest = np.where(np.abs(seen[right] - np.arange(len(scale))) < np.abs(seen[left] - np.arange(len(scale))), right, left)
+    clamped = within.any(1) & ~within[:, list(OUTER_EYE_CORNERS)].all(1)
+    return np.where(clamped, scale[seen[nearest]], scale)
 
 
 def _open(points: np.ndarray) -> np.ndarray:
-    """How open each eye is [T, 2], left then right, from the lid gap over the eye's width."""
+    """How open each eye is [T, 2], left then right, from the lid gap over the eye's width.
+
+    The gap is a mean of vectors across the line of the corners, with a sign: noise would hold a shut eye open else.
+    """
     eyes = []
-    for pairs, corners in zip(LID_PAIRS, EYE_CORNERS, strict=True):
+    for pairs, corners, side in zip(LID_PAIRS, EYE_CORNERS, (1, -1), strict=True):
         upper, lower = np.moveaxis(points[:, np.array(pairs)], 2, 0)
-        width = np.linalg.norm(points[:, corners[0]] - points[:, corners[1]], axis=1)
-        gap = np.linalg.norm(upper - lower, axis=2).mean(1) / np.maximum(width, 1e-6)
-        eyes.append(np.clip((gap - SHUT) / (OPEN - SHUT), 0, 1))
+        along = side * (points[:, corners[0]] - points[:, corners[1]])  # towards the subject's left
+        width = np.maximum(np.linalg.norm(along, axis=1), 1e-6)[:, None]
+        gap = (lower - upper).mean(1)
+        gap = gap - (gap * along).sum(1, keepdims=True) / width**2 * along
+        down = np.sign(along[:, 0] * gap[:, 1] - along[:, 1] * gap[:, 0])
+        eyes.append(np.clip((down * np.linalg.norm(gap, axis=1) / width[:, 0] - SHUT) / (OPEN - SHUT), 0, 1))
     return np.stack(eyes, 1)

@@ -24,6 +24,7 @@ SAMPLED = ("face", "ears")
 DEPTH_TOLERANCE_M = 0.004
 Z_BUFFER = 192  # longer side of the visibility buffer
 LEVELS = (0.030, 0.012)  # blur of the pyramid's levels, in inter-ocular distances
+LEAST_EXPLAINED = 0.05  # a light that explains less than this of keyframes kept out is left out
 LEAST_BLUR_PX = 1.5  # blur of the finest level is never smaller
 
 
@@ -43,7 +44,7 @@ class Appearance:
     albedo: np.ndarray  # [levels, P] grey, NaN where a sample was never seen
     light: np.ndarray  # [8] spherical harmonics of order 1 and 2 over the constant one; zeros: no light model
     sigma: np.ndarray  # [levels] robust standard deviation of the residual on keyframes, grey values
-    explained: float  # part of the keyframes' residual variance that the light explains
+    explained: float  # part of the residual variance that the light explains on keyframes it was not learned from
 
 
 def choose_samples(rig: Rig, count: int, seed: int = 0) -> Samples:
@@ -127,7 +128,7 @@ def visible(rig_vertices: Surface, triangles: np.ndarray, pose: Pose, lens: Came
     mesh = raster.project(posed(rig_vertices, pose).points, lens.focal_px * shrink, lens.centre_px * shrink)
     first, second, third = (mesh[triangles[:, k], :2] for k in range(3))
     side, other = second - first, third - first
-    front = side[:, 0] * other[:, 1] > side[:, 1] * other[:, 0]  # outward triangles run clockwise on a screen with y down
+    front = side[:, 0] * other[:, 1] < side[:, 1] * other[:, 0]  # seen from outside, outward triangles run anticlockwise
     _, depth, _ = raster.rasterise(mesh, triangles[front], shape)
     pixel = camera.project(points, lens.focal_px * shrink, lens.centre_px * shrink).astype(int)
     inside = ((pixel >= 0) & (pixel < [shape[1], shape[0]])).all(1)
@@ -184,34 +185,60 @@ def robust_gain(columns: np.ndarray, value: np.ndarray, root: np.ndarray, sigma:
     return fitted
 
 
-def learn(pictures: list[list[Level]], pixels: np.ndarray, weights: np.ndarray, normals: np.ndarray, light: bool) -> Appearance:
+def inside(alpha: np.ndarray, pixels: np.ndarray, margin_px: float) -> np.ndarray:
+    """Which pixels [P, 2] lie inside a matte [H, W] uint8, at least margin_px from its edge [P] bool."""
+    height, width = alpha.shape
+    reach = int(np.ceil(margin_px))
+    place = pixels.astype(int)
+    out = ((place >= 0) & (place < [width, height])).all(1)
+    for across, down in (
+        (0, 0),
+        (-reach, 0),
+        (reach, 0),
+        (0, -reach),
+        (0, reach),
+    ):  # beyond the picture's border is not background
+        near = np.clip(place + [across, down], 0, [width - 1, height - 1])
+        out &= alpha[near[:, 1], near[:, 0]] > 127
+    return out
+
+
+def learn(pictures: list[list[Level]], pixels: np.ndarray, weights: np.ndarray, normals: np.ndarray) -> Appearance:
     """Albedo, light and residual spread from keyframes, by alternation.
+
+    The light is modelled only where it explains keyframes that it was not learned from: every other one is kept out once.
 
     Args:
         pictures: K pyramids; pixels: [K, P, 2]; weights: [K, P] 0 where not seen; normals: [K, P, 3] camera axes.
-        light: fit the spherical harmonics; else one constant light.
     """
     keyframes, count = weights.shape
     values = np.zeros((len(LEVELS), keyframes, count))
     weights = weights.copy()
     for k in range(keyframes):
         for level, picture in enumerate(pictures[k]):
-            value, inside = read(picture, pixels[k])
+            value, seen = read(picture, pixels[k])
             values[level, k] = value[:, 0]
-        weights[k] *= inside
+        weights[k] *= seen
     shapes = np.stack([harmonics(normal) for normal in normals])  # [K, P, 8]
-    albedo, sigma, coefficients, explained = [], [], np.zeros(8), 0.0
-    for level in reversed(range(len(LEVELS))):  # the light comes from the finest level
-        flat = _alternate(values[level], weights, None)
-        if level == len(LEVELS) - 1 and light:
-            lit = _alternate(values[level], weights, shapes)
-            explained = 1 - lit[2] ** 2 / max(flat[2] ** 2, 1e-12)
-            coefficients = lit[1]
-        shade = 1 + shapes @ coefficients
-        one = _alternate(values[level] / np.clip(shade, 0.3, None), weights, None)
-        albedo.insert(0, one[0])
-        sigma.insert(0, max(one[2], 1.0))
-    return Appearance(np.stack(albedo), coefficients, np.array(sigma), float(explained))
+    explained = _explained(values[-1], weights, shapes) if keyframes >= 6 else 0.0
+    light = _alternate(values[-1], weights, shapes)[1] if explained > LEAST_EXPLAINED else np.zeros(8)
+    shade = np.clip(1 + shapes @ light, 0.3, None)
+    fitted = [_alternate(value / shade, weights, None) for value in values]
+    sigma = np.array([max(one[2], 1.0) for one in fitted])
+    return Appearance(np.stack([one[0] for one in fitted]), light, sigma, explained)
+
+
+def _explained(values: np.ndarray, weights: np.ndarray, shapes: np.ndarray) -> float:
+    """Part of the residual variance of every other keyframe that the light of the others explains (negative: it harms)."""
+    learned, kept = slice(0, None, 2), slice(1, None, 2)
+    spreads = []
+    for basis in (None, shapes):
+        albedo, light, _ = _alternate(values[learned], weights[learned], None if basis is None else basis[learned])
+        known = np.where(np.isfinite(albedo), weights[kept], 0.0)
+        told = np.nan_to_num(albedo) * np.clip(1 + shapes[kept] @ light, 0.3, None)  # unknown samples weigh nothing
+        gain = (known * told * values[kept]).sum(1) / np.maximum((known * told**2).sum(1), 1e-9)
+        spreads.append(np.median(np.abs(values[kept] - gain[:, None] * told)[known > 0]) if (known > 0).any() else 1.0)
+    return float(1 - (spreads[1] / max(spreads[0], 1e-9)) ** 2)
 
 
 def _alternate(values: np.ndarray, weights: np.ndarray, shapes: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, float]:

@@ -34,6 +34,8 @@ class Look:
     weight: np.ndarray  # [P] float32, 0 where hidden
     shade: np.ndarray  # [P] float32 light on each sample
     pixels: np.ndarray  # [P, 2] float32
+    rim: silhouette.Rim | None  # the mesh's outline against the matte; None without the term
+    edge: silhouette.Edge | None
 
 
 class Pictures:
@@ -42,7 +44,9 @@ class Pictures:
     `learn` must have run before `terms` gives photometric ones.
     """
 
-    def __init__(self, rig: Rig, frames: np.ndarray, alpha: np.ndarray, scale_px: np.ndarray, strength: Strength, samples: int) -> None:
+    def __init__(
+        self, rig: Rig, frames: np.ndarray, alpha: np.ndarray, scale_px: np.ndarray, strength: Strength, samples: int
+    ) -> None:
         """
         Args:
             frames: [T, H, W, 3] uint8; alpha: [T, H, W] uint8, the person; scale_px: [T] inter-ocular distance; samples: P.
@@ -71,34 +75,27 @@ class Pictures:
             pixels.append(camera.project(at.points[facing], lens.focal_px, lens.centre_px))
         self.skin = silhouette.skin_of([self.frames[row] for row in rows], pixels)
 
-    def learn(self, rows: Sequence[int], state: State, lens: Camera, light: bool = True) -> Appearance:
+    def learn(self, rows: Sequence[int], state: State, lens: Camera) -> Appearance:
         """Albedo and light from training keyframes (state of these rows)."""
-        whole, samples = self.fold(state.shape)
+        _, samples = self.fold(state.shape)
         pyramids, pixels, weights, normals = [], [], [], []
         for k, row in enumerate(rows):
-            pose = state.pose(k)
-            at = posed(samples, pose)
-            seen = photometric.visible(whole, self.rig.triangles, pose, lens, self.size, at.points)
-            pixels.append(camera.project(at.points, lens.focal_px, lens.centre_px))
-            pyramids.append(photometric.pyramid(self.frames[row], pixels[-1], self.scale_px[row], range(FINEST + 1)))
-            weights.append(photometric.weights_of(samples, pose, seen))
-            normals.append(samples.normal @ pose.rotation.T)
-        self.appearance = photometric.learn(pyramids, np.stack(pixels), np.stack(weights), np.stack(normals), light)
+            pixel, weight = self._seen(row, state.pose(k), state.shape, lens)
+            pixels.append(pixel)
+            pyramids.append(photometric.pyramid(self.frames[row], pixel, self.scale_px[row], range(FINEST + 1)))
+            weights.append(weight)
+            normals.append(samples.normal @ state.rotation[k].T)
+        self.appearance = photometric.learn(pyramids, np.stack(pixels), np.stack(weights), np.stack(normals))
         return self.appearance
 
-    def silhouette_term(self, row: int, pose: Pose, shape: np.ndarray, lens: Camera) -> tuple[Term, Surface] | None:
-        """The silhouette term of one frame and its unfolded surface; None where the mesh's rim is not in the picture."""
-        edge = silhouette.edge_of(self.alpha[row])
-        whole, _ = self.fold(shape)
-        scale = self.scale_px[row]
-        rim = silhouette.rim_of(self.rig, whole, pose, lens, self.size, self.frames[row], edge, self.skin, scale)
-        if rim is None:
-            return None
-        strength = self.strength
-        term = silhouette.term_of(
-            rim, edge, shape, strength.silhouette_sigma * scale, strength.silhouette, lens, strength.silhouette_robust
-        )
-        return term, rim.surface
+    def _seen(self, row: int, pose: Pose, shape: np.ndarray, lens: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels [P, 2] and weights [P] of the samples: nothing for hidden ones and where the blur mixes in the background."""
+        whole, samples = self.fold(shape)
+        at = posed(samples, pose)
+        seen = photometric.visible(whole, self.rig.triangles, pose, lens, self.size, at.points)
+        pixel = camera.project(at.points, lens.focal_px, lens.centre_px)
+        seen &= photometric.inside(self.alpha[row], pixel, photometric.LEVELS[FINEST] * self.scale_px[row])
+        return pixel, photometric.weights_of(samples, pose, seen)
 
     def silhouette_extra(self, rows: Sequence[int], state: State, centre_px: np.ndarray):
         """Extra terms of the joint calibration (see `fitting.calibrate.refine`): the rim is found around `state`, then held."""
@@ -106,7 +103,9 @@ class Pictures:
         edges = [silhouette.edge_of(self.alpha[row]) for row in rows]
         whole, _ = self.fold(state.shape)
         rims = [
-            silhouette.rim_of(self.rig, whole, state.pose(k), lens, self.size, self.frames[row], edges[k], self.skin, self.scale_px[row])
+            silhouette.rim_of(
+                self.rig, whole, state.pose(k), lens, self.size, self.frames[row], edges[k], self.skin, self.scale_px[row]
+            )
             for k, row in enumerate(rows)
         ]
 
@@ -124,18 +123,29 @@ class Pictures:
 
     def look(self, row: int, pose: Pose, shape: np.ndarray, lens: Camera) -> Look:
         """Visibility and shading of the samples around a pose: worked out once a frame, they change slowly."""
-        whole, samples = self.fold(shape)
-        at = posed(samples, pose)
-        seen = photometric.visible(whole, self.rig.triangles, pose, lens, self.size, at.points)
-        shade = np.clip(1 + photometric.harmonics(samples.normal @ pose.rotation.T) @ self.appearance.light, 0.3, None)
-        return Look(
-            photometric.weights_of(samples, pose, seen).astype(np.float32),
-            shade.astype(np.float32),
-            camera.project(at.points, lens.focal_px, lens.centre_px).astype(np.float32),
-        )
+        pixel, weight = self._seen(row, pose, shape, lens)
+        shade = np.ones(len(pixel))
+        if self.appearance is not None:
+            normal = self.fold(shape)[1].normal @ pose.rotation.T
+            shade = np.clip(1 + photometric.harmonics(normal) @ self.appearance.light, 0.3, None)
+        rim = edge = None
+        if self.strength.silhouette:
+            edge, whole = silhouette.edge_of(self.alpha[row]), self.fold(shape)[0]
+            rim = silhouette.rim_of(self.rig, whole, pose, lens, self.size, self.frames[row], edge, self.skin, self.scale_px[row])
+        return Look(weight.astype(np.float32), shade.astype(np.float32), pixel.astype(np.float32), rim, edge)
+
+    def silhouette_terms(self, row: int, look: Look, shape: np.ndarray, lens: Camera) -> list[Term]:
+        """The silhouette term of one frame, if it has one."""
+        if look.rim is None:
+            return []
+        strength, sigma = self.strength, self.strength.silhouette_sigma * self.scale_px[row]
+        term = silhouette.term_of(look.rim, look.edge, shape, sigma, strength.silhouette, lens, strength.silhouette_robust)
+        return [term]
 
     def photometric_terms(self, row: int, look: Look, shape: np.ndarray, lens: Camera, levels: Sequence[int]) -> list[Term]:
-        """The photometric term of one frame at some pyramid levels."""
+        """The photometric term of one frame at some pyramid levels; none where it is off."""
+        if self.appearance is None:
+            return []
         _, samples = self.fold(shape)
         pyramid = photometric.pyramid(self.frames[row], look.pixels, self.scale_px[row], levels)
         strength, appearance = self.strength, self.appearance
@@ -145,7 +155,9 @@ class Pictures:
             robust = strength.photometric_robust
             return Term(
                 samples,
-                lambda at: photometric.photometric_rows(picture, colour, look.weight, sigma, strength.photometric, lens, robust, at),
+                lambda at: photometric.photometric_rows(
+                    picture, colour, look.weight, sigma, strength.photometric, lens, robust, at
+                ),
             )
 
         return [one(picture, level) for picture, level in zip(pyramid, levels, strict=True)]

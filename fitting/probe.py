@@ -16,8 +16,25 @@ from fitting.config import ProbeConfig
 from fitting.detection import Face, FaceFinder, FaceTrack, find_small
 from workflow import step
 
-KEYS = ("accepted", "reason", "file", "codec", "pixel_format", "fps", "variable_frame_rate", "frames", "duration_s",
-        "rotation_degrees", "mirrored", "source_size", "crop", "face_found_fraction", "faces_max", "head_size_px", "warnings")
+KEYS = (
+    "accepted",
+    "reason",
+    "file",
+    "codec",
+    "pixel_format",
+    "fps",
+    "variable_frame_rate",
+    "frames",
+    "duration_s",
+    "rotation_degrees",
+    "mirrored",
+    "source_size",
+    "crop",
+    "face_found_fraction",
+    "faces_max",
+    "head_size_px",
+    "warnings",
+)
 """Of probe.json, always all of them; null where a rejected video did not get that far."""
 SAMPLES = 48
 MIN_FRAMES = 30
@@ -122,8 +139,11 @@ def capture_warnings(facts: video.StreamFacts, samples: Samples, head_px: float)
     if missing > 0.02 * samples.looked:
         found.append(f"no face in {missing} of {samples.looked} sampled frames: keep the face towards the camera")
     height, width = facts.size
-    edges = [face for face in samples.kept if (face.points[:, :2].min(axis=0) < 0.0).any()
-             or (face.points[:, :2].max(axis=0) > [width, height]).any()]
+    edges = [
+        face
+        for face in samples.kept
+        if (face.points[:, :2].min(axis=0) < 0.0).any() or (face.points[:, :2].max(axis=0) > [width, height]).any()
+    ]
     if len(edges) > CLOSE_TO_BORDER * len(samples.kept):
         found.append(f"the face is cut by the frame's border in {len(edges)} of {samples.looked} sampled frames: keep it inside")
     if np.median(samples.luminance) < DARK:
@@ -142,8 +162,10 @@ def rejection(samples: Samples, packets: int) -> str | None:
     if not samples.kept:
         return f"no face in any of {samples.looked} sampled frames; film one face, upright and well lit"
     if len(samples.kept) < MIN_FACE_FRACTION * samples.looked:
-        return (f"a face in only {len(samples.kept)} of {samples.looked} sampled frames, at least half is needed; keep the face "
-                f"in view of the camera")
+        return (
+            f"a face in only {len(samples.kept)} of {samples.looked} sampled frames, at least half is needed; keep the face "
+            f"in view of the camera"
+        )
     return None
 
 
@@ -158,16 +180,25 @@ def measure(job: step.Job) -> dict[str, Any]:
     stream = asdict(facts)
     report |= {key: stream[key] for key in ("codec", "pixel_format", "fps", "variable_frame_rate")}
     samples = look(path, facts.packets, job.input.landmarker.read_bytes(), job)
-    report |= {"frames": samples.decoded, "duration_s": samples.seconds + 1.0 / facts.fps,
-               "rotation_degrees": facts.rotation_degrees, "mirrored": facts.mirrored, "source_size": list(facts.size)}
+    report |= {
+        "frames": samples.decoded,
+        "duration_s": samples.seconds + 1.0 / facts.fps,
+        "rotation_degrees": facts.rotation_degrees,
+        "mirrored": facts.mirrored,
+        "source_size": list(facts.size),
+    }
     report["face_found_fraction"] = len(samples.kept) / samples.looked if samples.looked else 0.0
     report["faces_max"] = samples.faces_max
     reason = rejection(samples, facts.packets)
     if reason is not None:
         return report | {"reason": f"{path.name}: {reason}"}
     head_px = HEAD_PER_FACE * float(np.median([face.size_px for face in samples.kept]))
-    return report | {"accepted": True, "crop": crop_box(samples.kept, facts.size), "head_size_px": head_px,
-                     "warnings": capture_warnings(facts, samples, head_px)}
+    return report | {
+        "accepted": True,
+        "crop": crop_box(samples.kept, facts.size),
+        "head_size_px": head_px,
+        "warnings": capture_warnings(facts, samples, head_px),
+    }
 
 
 def run(job: step.Job) -> None:

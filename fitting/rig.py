@@ -62,10 +62,13 @@ class Surface:
     joints: np.ndarray  # [3, 3] jaw, left eye, right eye
     joint_shape_basis: np.ndarray  # [3, 3, S]
     joint_expression_basis: np.ndarray  # [3, 3, E]
+    view_basis: np.ndarray | None = None  # [P, 3, 2] m, points that slide with the view direction (detected landmarks)
 
     def folded(self, shape: np.ndarray, bias: np.ndarray | float = 0.0) -> Surface:
         """The same points of one identity [S], moved by a constant bias [P, 3] m."""
-        return replace(self, base=self.base + self.shape_basis @ shape + bias, joints=self.joints + self.joint_shape_basis @ shape)
+        return replace(
+            self, base=self.base + self.shape_basis @ shape + bias, joints=self.joints + self.joint_shape_basis @ shape
+        )
 
 
 @dataclass(frozen=True)
@@ -91,10 +94,12 @@ class Rig:
         self.expression_basis = np.ascontiguousarray(np.moveaxis(as_array(head.expression_basis), 0, -1))  # [V, 3, E]
         self.skin = as_array(head.skinning_weights)[:, list(JOINTED)]
         pose_basis = as_array(head.pose_basis)[9:]  # the neck's nine stay zero
-        self.pose_basis = np.ascontiguousarray(np.moveaxis(pose_basis, 0, -1)) if len(pose_basis) else np.zeros((*self.template.shape, 0))
+        self.pose_basis = (
+            np.ascontiguousarray(np.moveaxis(pose_basis, 0, -1)) if len(pose_basis) else np.zeros((*self.template.shape, 0))
+        )
         self.joints = as_array(head.joints)[list(JOINTED)]
         self.joint_shape_basis = np.moveaxis(as_array(head.joint_shape_basis)[:, list(JOINTED)], 0, -1)
-        self.joint_expression_basis = np.moveaxis(as_array(head.joint_expression_basis)[:, list(JOINTED)], 0, -1) if hasattr(head, "joint_expression_basis") else np.zeros((3, 3, len(head.expression_basis)))
+        self.joint_expression_basis = np.moveaxis(as_array(head.joint_expression_basis)[:, list(JOINTED)], 0, -1)
         self.triangles = head.triangles.cpu().numpy()
         self.region = head.region.cpu().numpy()
         self.low = as_array(head.expression_low)
@@ -104,7 +109,9 @@ class Rig:
     def surface(self, triangles: np.ndarray, barycentric: np.ndarray) -> Surface:
         """Points at barycentric places [P, 3] of triangles [P] (numbers)."""
         corners = self.triangles[triangles]
-        mix = lambda values: sum(barycentric[:, k].reshape(-1, *[1] * (values.ndim - 1)) * values[corners[:, k]] for k in range(3))  # noqa: E731
+        mix = lambda values: sum(
+            barycentric[:, k].reshape(-1, *[1] * (values.ndim - 1)) * values[corners[:, k]] for k in range(3)
+        )  # noqa: E731
         corner = self.template[corners]
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -135,6 +142,11 @@ class Rig:
         )
 
 
+def view_direction(pose: Pose) -> np.ndarray:
+    """Where the camera stands as seen from the head [2]: across and down of the unit vector in the head frame."""
+    return -(pose.rotation.T @ pose.translation)[:2] / np.linalg.norm(pose.translation)
+
+
 def posed(surface: Surface, pose: Pose) -> Posed:
     """Points of a folded surface in one pose: expression, correctives, skinning about jaw and eyes, then the rigid motion."""
     count = surface.expression_basis.shape[2]
@@ -151,6 +163,8 @@ def posed(surface: Surface, pose: Pose) -> Posed:
     if len(moving):
         head = rest.copy()
         head[moving] += np.einsum("pk,kpi->pi", skin, turned + joints[:, None] - rest[moving])
+    if surface.view_basis is not None:
+        head = head + surface.view_basis @ view_direction(pose)
     return Posed(surface, pose, head, head @ pose.rotation.T + pose.translation, moving, blend, skin.T[..., None] * turned)
 
 
@@ -195,6 +209,13 @@ def jacobian(posed_points: Posed, covector: np.ndarray, point: np.ndarray) -> np
     _fill(np.ascontiguousarray(covector), at_rest, point, arm, surface.expression_basis, out)
     if len(rows):
         _joint_columns(posed_points, local, at_rest, point, rows, place, out)
+    if surface.view_basis is not None:
+        slid = np.einsum("mi,mik->mk", local, surface.view_basis[point])
+        distance = np.linalg.norm(pose.translation)
+        axes = pose.rotation[:, :2]
+        out[:, :3] += slid @ np.cross(pose.translation, axes.T) / distance
+        unit = pose.translation / distance
+        out[:, 3:POSE] -= slid @ (axes.T - np.outer(axes.T @ unit, unit)) / distance
     return out
 
 
@@ -202,7 +223,11 @@ def _joint_columns(posed_points: Posed, local: np.ndarray, at_rest: np.ndarray, 
     """Columns of gaze and jaw, for the rows whose points hang from a joint."""
     surface, pose = posed_points.surface, posed_points.pose
     start = POSE + surface.expression_basis.shape[2]
-    columns = ((0, slice(start + GAZE, start + GAZE + JAW), 3), (1, slice(start, start + 2), 2), (2, slice(start + 2, start + 4), 2))
+    columns = (
+        (0, slice(start + GAZE, start + GAZE + JAW), 3),
+        (1, slice(start, start + 2), 2),
+        (2, slice(start + 2, start + 4), 2),
+    )
     vectors = pose.vectors
     turns, left = camera.exp_rotation(vectors), camera.left_jacobian(vectors)
     for joint, column, axes in columns:

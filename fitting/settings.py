@@ -37,14 +37,15 @@ SMOOTHNESS = Smoothness(
     rotation_rad=np.radians(0.4), across_m=0.0005, depth_m=0.001, expression=0.15, gaze_rad=np.radians(4), jaw_rad=np.radians(2)
 )
 BUNDLE_ITERATIONS = 2
-BIAS_SD_M = 0.0015  # what the embedding's own views disagree by
+BIAS_SD_M = 0.0025  # landmarks slide over the surface from one identity to the next (simulated clips)
 FOCAL_OF_LONG_SIDE = 1.2  # prior of focal length over the longer source side (45 degrees)
 MAX_FOCAL_SD = 0.15
+ANOTHER_FACE = 2.5  # a stretch between two cuts whose median error is this many times the clip's shows somebody else
 LOST_OF_MEDIAN, LOST_OF_EYES = 4.0, 0.05  # a frame this much worse than the median, and this bad, is lost
 SAMPLES = 2000
 PIXEL_ITERATIONS = 3  # a level of the photometric pyramid
 SILHOUETTE_ROUNDS = 3  # the rim is found anew this often
-STRENGTH = Strength(photometric=0.1, photometric_robust=3.0, silhouette=0.05, silhouette_sigma=0.01, silhouette_robust=3.0)
+STRENGTH = Strength(photometric=0.02, photometric_robust=3.0, silhouette=0.05, silhouette_sigma=0.01, silhouette_robust=3.0)
 
 
 def weights(terms: TermWeights) -> Weights:
@@ -62,4 +63,6 @@ def weights(terms: TermWeights) -> Weights:
 
 def strength(terms: TermWeights) -> Strength:
     """The pixel terms with their weights from config."""
-    return replace(STRENGTH, photometric=STRENGTH.photometric * terms.photometric, silhouette=STRENGTH.silhouette * terms.silhouette)
+    return replace(
+        STRENGTH, photometric=STRENGTH.photometric * terms.photometric, silhouette=STRENGTH.silhouette * terms.silhouette
+    )

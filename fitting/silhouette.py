@@ -73,7 +73,9 @@ def skin_of(images: list[np.ndarray], pixels: list[np.ndarray]) -> Skin:
         raise ValueError(f"only {len(features)} pixels of skin")
     mean = np.median(features, 0)
     away = features - mean
-    keep = np.linalg.norm(away / (1.4826 * np.median(np.abs(away), 0) + 1e-3), axis=1) < 4  # brows, lips and nostrils are not skin
+    keep = (
+        np.linalg.norm(away / (1.4826 * np.median(np.abs(away), 0) + 1e-3), axis=1) < 4
+    )  # brows, lips and nostrils are not skin
     covariance = np.cov(away[keep].T) + np.diag([0.006, 0.006, 0.12]) ** 2
     return Skin(features[keep].mean(0), np.linalg.inv(covariance))
 

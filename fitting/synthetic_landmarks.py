@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 
 from fitting.correspondence import LEFT_IRIS, RIGHT_IRIS
 from fitting.head_model import HeadModel
+from fitting.landmark_model import IRIS_RINGS
 
 GAZE_UNIT_RAD = 0.3  # turn of the eyes at which the coupled motion reaches its amplitude
 GAZE_REACH_M = 0.03  # distance from the eye over which it falls to the far amplitude
@@ -61,7 +62,8 @@ def landmark_track(
     """What a faulty detector would report.
 
     Args:
-        head: gives the landmark embedding; landmarks without a place report the mean of the others.
+        head: gives the landmark embedding; landmarks without a place report the mean of the others,
+            those of an iris its centre.
         vertices: [T, V, 3] m, camera axes; project: camera-space points [..., 3] -> px [..., 2] (`synthetic.Camera.project`).
         expression: [T, E] true actions in the head's order; eyes: [T, 2, 3] axis-angle, left then right.
     """
@@ -88,6 +90,8 @@ def landmark_track(
     out = np.empty((frames, len(head.landmark_triangles), 3), np.float32)
     out[:] = np.concatenate([moved.mean(1, keepdims=True), np.zeros((frames, 1, 1))], -1)
     out[:, placed] = np.concatenate([moved, (depth * scale)[..., None]], -1)
+    for ring in IRIS_RINGS:  # a ring without a place lies around its centre
+        out[:, [point for point in ring if not placed[point]]] = out[:, ring[:1]]
     found = np.ones(frames, bool)
     found[[k for k in faults.lost if k < frames]] = False
     out[~found] = np.nan

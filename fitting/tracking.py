@@ -83,12 +83,15 @@ def fit_clip(clip: Clip, config: FitConfig, bar: Bar = lambda rows, _: rows, hel
             calibration = _look(clip, config, pictures, calibration, weights)
     shared = calibration.state
     with _timed(seconds, "track"):
-        tracker = stages.Tracker(clip.model, clip.observed, weights, shared, calibration.actions, calibration.held, _solver(config))
+        tracker = stages.Tracker(
+            clip.model, clip.observed, weights, shared, calibration.actions, calibration.held, _solver(config)
+        )
         state, reinit = _track(clip, config, tracker, bar)
     looks: dict[int, Look] = {}
-    if pictures is not None and config.weights.photometric:
-        with _timed(seconds, "photometric"):
-            pictures.learn(calibration.keyframes, state.frames(calibration.keyframes), shared.lens(clip.observed.centre_px))
+    if pictures is not None:
+        with _timed(seconds, "pixels"):
+            if config.weights.photometric:
+                pictures.learn(calibration.keyframes, state.frames(calibration.keyframes), shared.lens(clip.observed.centre_px))
             state, looks = _refine(clip, tracker, pictures, state, bar)
     cut = bundle.cuts(state, found)
     before = state
@@ -97,7 +100,7 @@ def fit_clip(clip: Clip, config: FitConfig, bar: Bar = lambda rows, _: rows, hel
             state = _bundle(clip, config, tracker, pictures, looks, state, cut)
     rows = np.arange(len(found))
     error = stages.reprojection_px(clip.model, clip.observed, rows, state)
-    usable = _usable(clip, error, good)
+    usable = _usable(clip, error, good, cut)
     state = _hold(clip, state, usable)
     held = np.full(len(rows), np.nan)
     if held_out:
@@ -196,11 +199,12 @@ def _track(clip: Clip, config: FitConfig, tracker: stages.Tracker, bar: Bar) -> 
 
 
 def _problem(clip: Clip, tracker: stages.Tracker, pictures: Pictures | None, look: Look | None, row: int, pose: Pose, level: int) -> Problem:  # fmt: skip
-    """All terms of one frame around a pose; the photometric one where there is a look."""
+    """All terms of one frame around a pose; those that read pixels where there is a look."""
     problem = tracker.problem(row, pose.gaze)
     if look is None:
         return problem
-    extra = pictures.photometric_terms(row, look, tracker.shared.shape, tracker.lens, (level,))
+    shape, lens = tracker.shared.shape, tracker.lens
+    extra = pictures.photometric_terms(row, look, shape, lens, (level,)) + pictures.silhouette_terms(row, look, shape, lens)
     return replace(problem, terms=(*problem.terms, *extra))
 
 
@@ -208,9 +212,10 @@ def _refine(clip: Clip, tracker: stages.Tracker, pictures: Pictures, state: Stat
     """Each frame again with its pixels, coarse level first; frames do not read each other."""
     poses = [state.pose(row) for row in range(len(state))]
     looks = {}
+    levels = range(FINEST + 1) if pictures.appearance is not None else (FINEST,)
     for row in bar(np.flatnonzero(clip.observed.found), "pixels"):
         looks[row] = pictures.look(row, poses[row], tracker.shared.shape, tracker.lens)
-        for level in range(FINEST + 1):
+        for level in levels:
             problem = _problem(clip, tracker, pictures, looks[row], row, poses[row], level)
             poses[row] = solver.solve_frame(problem, poses[row], settings.PIXEL_ITERATIONS)[0]
     return state.with_poses(poses), looks
@@ -234,8 +239,8 @@ def _bundle(clip: Clip, config: FitConfig, tracker: stages.Tracker, pictures: Pi
     return state
 
 
-def _usable(clip: Clip, error: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """Frames whose fit can be trusted.
+def _usable(clip: Clip, error: np.ndarray, good: np.ndarray, cut: np.ndarray) -> np.ndarray:
+    """Frames whose fit can be trusted: not much worse than the median, and not a stretch between two cuts that fits another face.
 
     Raises:
         LostFace: a part has none.
@@ -243,6 +248,10 @@ def _usable(clip: Clip, error: np.ndarray, good: np.ndarray) -> np.ndarray:
     relative = error / clip.observed.scale_px
     median = np.median(relative[good])  # of training frames: the test tail decides nothing
     lost = (relative > settings.LOST_OF_MEDIAN * median) & (relative > settings.LOST_OF_EYES)
+    for stretch in np.split(np.arange(len(cut)), np.flatnonzero(cut)):
+        seen = stretch[clip.observed.found[stretch]]
+        if len(seen) < len(cut) and len(seen) and np.median(relative[seen]) > settings.ANOTHER_FACE * median:
+            lost[seen] = True
     usable = clip.observed.found & ~lost
     for name, part in (("training", clip.train), ("test", clip.test)):
         if not usable[part].any():
@@ -251,16 +260,17 @@ def _usable(clip: Clip, error: np.ndarray, good: np.ndarray) -> np.ndarray:
 
 
 def _hold(clip: Clip, state: State, usable: np.ndarray) -> State:
-    """Unusable frames: a short gap keeps what the bundle drew across it, a longer one takes the nearest usable frame of its part."""
+    """Frames without a face: a short gap keeps what the bundle drew across it, a longer one takes the nearest usable frame of its part.
+
+    A frame that has a face but is not usable keeps its own solved pose: blurred, it is still nearer than its neighbours'.
+    """
     for part in (clip.train, clip.test):
         rows = part[usable[part]]
         nearest = rows[np.abs(part[:, None] - rows).argmin(1)]
-        lost = ~usable[part]
-        for gap in np.split(np.flatnonzero(lost), np.flatnonzero(np.diff(np.flatnonzero(lost)) > 1) + 1):
-            inside = len(gap) and gap[0] > 0 and gap[-1] < len(part) - 1
-            if inside and len(gap) <= stages.LONG_GAP and not clip.observed.found[part[gap]].any():
+        lost = ~clip.observed.found[part]
+        places = np.flatnonzero(lost)
+        for gap in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
+            if len(gap) and gap[0] > 0 and gap[-1] < len(part) - 1 and len(gap) <= stages.LONG_GAP:
                 lost[gap] = False
         state = state.replaced(part[lost], state.frames(nearest[lost]))
     return state
-
-

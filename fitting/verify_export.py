@@ -25,7 +25,7 @@ Seen = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Flame:
-    """FLAME as its file holds it: axes x left of the subject, y up, z towards the viewer."""
+    """FLAME as its file holds it: joints in its order, axes x left of the subject, y up, z towards the viewer."""
 
     template: np.ndarray  # [V, 3] m
     shape_basis: np.ndarray  # [S, V, 3]
@@ -42,17 +42,19 @@ class Flame:
         plain = [e for e, name in enumerate(head.expression_names) if not name.startswith("eyelid")]
         signs = np.array([1.0, -1.0, -1.0])
         array = lambda tensor: np.asarray(tensor, np.float64)  # noqa: E731
+        file = np.argsort(array(head.source_joints))  # the baked joint that is the file's joint 0, 1, ...
+        correctives = array(head.pose_basis).reshape(4, 9, -1, 3)[file[1:] - 1].reshape(36, -1, 3)
         # A corrective belongs to an entry of R - I; entry (i, j) changes sign with axes i and j.
         entry = np.tile(np.outer(signs, signs).reshape(9), 4)[:, None, None]
         return Flame(
             template=array(head.template) * signs,
             shape_basis=array(head.shape_basis) * signs,
             expression_basis=array(head.expression_basis)[plain] * signs,
-            pose_basis=array(head.pose_basis) * signs * entry,
-            joints=array(head.joints) * signs,
-            joint_shape_basis=array(head.joint_shape_basis) * signs,
-            joint_expression_basis=array(head.joint_expression_basis)[plain] * signs,
-            weights=array(head.skinning_weights),
+            pose_basis=correctives * signs * entry,
+            joints=array(head.joints)[file] * signs,
+            joint_shape_basis=array(head.joint_shape_basis)[:, file] * signs,
+            joint_expression_basis=array(head.joint_expression_basis)[plain][:, file] * signs,
+            weights=array(head.skinning_weights)[:, file],
         )
 
     def posed(self, shape: np.ndarray, expression: np.ndarray, pose: np.ndarray) -> Seen:

@@ -70,8 +70,15 @@ class DecodedFrame:
         if space == UNSPECIFIED_COLORSPACE:
             # Nothing in the file says which; players take the HD matrix for HD sizes, and so did the camera's maker.
             space = Colorspace.ITU709 if self.native.height >= HD_HEIGHT_PX else Colorspace.ITU601
-        picture = self.native.reformat(width=width, height=height, format="rgb24", src_colorspace=space, interpolation=CONVERSION,
-                                       dst_color_range=ColorRange.JPEG, threads=1).to_ndarray()
+        picture = self.native.reformat(
+            width=width,
+            height=height,
+            format="rgb24",
+            src_colorspace=space,
+            interpolation=CONVERSION,
+            dst_color_range=ColorRange.JPEG,
+            threads=1,
+        ).to_ndarray()
         return upright(picture, display_matrix(self.native))
 
 
@@ -124,8 +131,11 @@ def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
     try:
         container = av.open(str(path), metadata_errors="replace")
     except (av.error.FFmpegError, ValueError) as error:
-        raise VideoError(f"not readable as a video ({error.strerror or error}); export it again as MP4"
-                         if isinstance(error, av.error.FFmpegError) else f"not readable as a video ({error})") from None
+        raise VideoError(
+            f"not readable as a video ({error.strerror or error}); export it again as MP4"
+            if isinstance(error, av.error.FFmpegError)
+            else f"not readable as a video ({error})"
+        ) from None
     streams = [stream for stream in container.streams.video if not _is_cover_picture(stream)]
     if not streams:
         kinds = sorted({stream.type for stream in container.streams}) or ["nothing"]
@@ -169,15 +179,26 @@ def inspect(path: Path) -> StreamFacts:
         rate = stream.average_rate or stream.guessed_rate or stream.base_rate or Fraction(30)
     first = next(read_frames(path), None)
     if first is None:
-        raise VideoError(f"a {codec} stream of {packets} packets from which no frame decodes; the file is empty or damaged, "
-                         f"copy it anew")
+        raise VideoError(
+            f"a {codec} stream of {packets} packets from which no frame decodes; the file is empty or damaged, copy it anew"
+        )
     fps, variable = _intervals(times) if len(set(times)) > 2 else (float(rate), False)
     matrix = display_matrix(first.native)
     rotation, mirrored = _turn(matrix)
     height, width = first.rgb().shape[:2]
     duration = max(times) - min(times) + 1.0 / fps if times else packets / fps
-    return StreamFacts(codec, first.native.format.name, fps, variable, packets, duration, rotation, mirrored, (height, width),
-                       HDR_TRANSFERS.get(first.native.color_trc))
+    return StreamFacts(
+        codec,
+        first.native.format.name,
+        fps,
+        variable,
+        packets,
+        duration,
+        rotation,
+        mirrored,
+        (height, width),
+        HDR_TRANSFERS.get(first.native.color_trc),
+    )
 
 
 def read_frames(path: Path, threads: int = 1) -> Iterator[DecodedFrame]:
@@ -256,8 +277,13 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, comment: s
                 raise ValueError(f"frame {count} is {frame.dtype}{frame.shape}, expected uint8{size}")
             picture = np.pad(frame, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
             native = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            native = native.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG,
-                                     interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND, threads=1)
+            native = native.reformat(
+                format="yuv420p",
+                dst_colorspace=Colorspace.ITU709,
+                dst_color_range=ColorRange.MPEG,
+                interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND,
+                threads=1,
+            )
             native.pts, native.time_base = count, stream.codec_context.time_base
             container.mux(stream.encode(native))
             count += 1

@@ -93,6 +93,17 @@ def content(head: HeadModel | None = None) -> dict:
     }
 
 
+def other_eye_order() -> dict:
+    """The same model with its eye joints in the other order: weights, regressor and correctives."""
+    order = [0, 1, 2, 4, 3]
+    other = dict(content())
+    other["weights"], other["J"] = other["weights"][:, order], other["J"][order]
+    other["J_regressor"] = scipy.sparse.csc_matrix(other["J_regressor"].toarray()[order])
+    blocks = other["posedirs"].reshape(-1, 3, 4, 9)
+    other["posedirs"] = blocks[:, :, [0, 1, 3, 2]].reshape(-1, 3, 36)
+    return other
+
+
 @cache
 def checked() -> dict:
     """What `flame.read` makes of the file."""

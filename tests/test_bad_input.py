@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -75,6 +76,7 @@ def test_config_of_a_run(pipeline: Pipeline, argument: str, expected: str) -> No
         ("variants: {demo: {prset: fast}}", "variants.demo.prset is not a key; did you mean variants.demo.preset?"),
         ("variants: {demo: {preset: quick}}", "config/presets: there is no preset 'quick'; the presets are demo, fast, paper"),
         ("variants: {fit: {preset: demo}}", "variants.fit: this name is taken"),
+        ("variants: {export: {preset: demo}}", "variants.export: this name is taken"),
         ("variants: {mean_frame: {preset: demo}}", "variants.mean_frame: this name is taken"),
         ("variants: {a/b: {preset: demo}}", "variants.a/b: use letters, digits, _ and - only"),
         ("variants: {}", "variants is empty; name at least one"),
@@ -144,3 +146,10 @@ def test_planning_imports_no_heavy_package(pipeline: Pipeline) -> None:
     imported = set(done.stdout.rpartition("IMPORTED")[2].split())
     assert "avatar.config" in imported
     assert not imported & {"torch", "cv2", "mediapipe", "numba", "scipy", "anny", "fitting.head_model"}
+
+
+def test_no_variant_can_take_a_folder_that_a_rule_writes() -> None:
+    written = set()
+    for path in (REPOSITORY / "workflow" / "rules").glob("*.smk"):
+        written |= set(re.findall(r"results/\{subject\}/([a-z_]+)/", path.read_text()))
+    assert {"fit", "export"} <= written <= settings.RESERVED_VARIANTS

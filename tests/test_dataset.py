@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from exported import flame_like
 from toy_head import toy_head, toy_images, toy_track
 
 from avatar import coverage
@@ -34,6 +35,20 @@ def test_rays_pass_through_the_vertices_that_project_to_their_pixels(subject: tu
         rays = scene.rays(frame, pixels[:, 0] - 0.5, pixels[:, 1] - 0.5)  # pixel centres at +0.5
         towards = scene.vertices_m[scene.place[frame]].numpy() - rays.origins_m
         np.testing.assert_allclose(towards / np.linalg.norm(towards, axis=1, keepdims=True), rays.directions, atol=2e-5)
+
+
+def test_camera_follows_joints_that_the_expression_moves() -> None:
+    """As FLAME's do: the rigid frame turns about a root joint of its own in each frame."""
+    head = flame_like()
+    track = toy_track(head, 3, SIZE)
+    track["rotation"] = track["rotation"] + np.array([0.2, 0.5, 0.1])
+    track["neck"] = -track["rotation"] * 0.3
+    scene = Scene(head, track, range(3))
+    names = ("shape", "expression", "rotation", "neck", "jaw", "eyes", "translation")
+    camera = head.forward(*(torch.as_tensor(np.asarray(track[name], np.float64)) for name in names)).numpy()
+    for frame in range(3):
+        pixels = camera[frame, :, :2] / camera[frame, :, 2:] * track["focal_px"] + track["centre_px"]
+        np.testing.assert_allclose(scene.pixels_of(frame, scene.vertices_m[frame].numpy()), pixels, atol=1e-3)
 
 
 def test_displacement_ignores_eyes_neck_and_pose(subject: tuple) -> None:

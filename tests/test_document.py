@@ -8,15 +8,16 @@ import jsonschema
 import pytest
 import yaml
 
+from avatar import document
 from avatar.config import RenderConfig, Settings, TrainConfig
-from workflow import document, environment, settings
+from workflow import environment, settings
 
 PRESETS = sorted((document.ROOT / "config" / "presets").glob("*.yaml"))
 CONFIG = yaml.safe_load((document.ROOT / "config" / "config.yaml").read_text(encoding="utf-8"))
 
 
 def test_readme_and_schema_are_current() -> None:
-    how = "run: python -m workflow.document"
+    how = "run: python -m avatar.document"
     assert document.README.read_text(encoding="utf-8") == document.readme(), how
     assert document.SCHEMA.read_text(encoding="utf-8") == document.schema(), how
 
@@ -53,9 +54,22 @@ def test_opencv_is_the_headless_contrib_build_alone() -> None:
     assert environment.problem() is None
 
 
+def pins_of(name: str) -> list[str]:
+    lines = (document.ROOT / name).read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line and not line.startswith(("#", "./"))]
+
+
 def test_requirements_pin_everything_exactly() -> None:
-    lines = (document.ROOT / "requirements.txt").read_text(encoding="utf-8").splitlines()
-    pins = [line for line in lines if line and not line.startswith(("#", "./"))]
-    assert all(line.count("==") == 1 and "+" not in line for line in pins)
+    pins = pins_of("requirements.txt")
+    assert all(line.count("==") == 1 and "+" not in line for line in [*pins, *pins_of("requirements-test.txt")])
     assert "torch==2.13.0" in pins
     assert not [line for line in pins if line.startswith(("torchvision", "opencv-contrib-python=", "opencv-python"))]
+
+
+def test_users_do_not_install_what_only_tests_need() -> None:
+    """smplx is under a licence for non-commercial research: no step imports it, and it comes with `make test` alone."""
+    assert [line.partition("==")[0] for line in pins_of("requirements-test.txt")] == ["smplx"]
+    assert not [line for line in pins_of("requirements.txt") if line.startswith("smplx")]
+    for package in ("avatar", "fitting", "workflow"):
+        for path in (document.ROOT / package).rglob("*.py"):
+            assert "import smplx" not in path.read_text(encoding="utf-8"), path

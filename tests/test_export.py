@@ -101,7 +101,7 @@ def test_limits_clip_to_one_percent_inside_and_touch_nothing_else(head: HeadMode
     np.testing.assert_array_equal(inside.jaw[2:], pose.jaw[2:])
     np.testing.assert_array_equal(inside.neck, pose.neck)
     assert nha_difference(nha_file(head, track), head, track).vertex_mm > 1  # against what the track says
-    assert nha_difference(nha_file(head, track), head, export._limited(track, pose)).vertex_mm < 0.001
+    assert nha_difference(nha_file(head, track), head, export._limited(head, track, pose)).vertex_mm < 0.001
 
 
 @pytest.mark.parametrize(

@@ -137,8 +137,16 @@ def test_tampering_between_writing_and_reading_fails_the_step(
 
 def test_rule_is_run_only_when_asked_for(tmp_path: Path) -> None:
     pipeline = Pipeline.create(tmp_path / "run", ("ann", "bob"))
+    for target in ("export_all", "results/ann/export/export.json"):
+        refused = pipeline.run("-n", target)
+        assert refused.code == 1 and "the default head (head.model: anny) cannot be written as FLAME codes" in refused.text
+    assert pipeline.plan() and not pipeline.ran()
+    (pipeline.folder / "generic_model.pkl").write_text("a file of FLAME")
+    pipeline.append("config/config.yaml", "head: {model: flame, path: generic_model.pkl}\n")
     asked = pipeline.plan("results/ann/export/export.json")
     assert {"export ann", "fit ann", "trim ann"} <= asked
     assert not [job for job in asked if "bob" in job or job.startswith("train")]
     assert pipeline.plan("export_all") >= {"export_all", "probe ann", "probe bob"}
     assert not [job for job in pipeline.plan() if job.startswith("export")]
+    text = pipeline.run("-n", "-p", "results/ann/export/export.json", "--config", "export={pictures: test}").text
+    assert '"pictures":"test"' in text

@@ -17,8 +17,9 @@ from workflow import step
 
 def extracted(path: Path, crop: dict[str, int], frames: int, source: tuple[int, int], **config: int) -> tuple[np.ndarray, dict]:
     folder = path.parent
-    (folder / "probe.json").write_text(json.dumps(
-        {"accepted": True, "reason": None, "frames": frames, "fps": 30.0, "source_size": list(source), "crop": crop}))
+    (folder / "probe.json").write_text(
+        json.dumps({"accepted": True, "reason": None, "frames": frames, "fps": 30.0, "source_size": list(source), "crop": crop})
+    )
     out = {"frames": folder / "frames.npy", "index": folder / "frames.json"}
     step.main(extract.run, ExtractConfig, arguments(config, {"video": path, "probe": folder / "probe.json"}, out))
     return np.load(out["frames"], mmap_mode="r"), json.loads(out["index"].read_text())

@@ -185,8 +185,10 @@ def test_a_damaged_archive_is_a_sentence(tmp_path: Path, index: Path, monkeypatc
 
 def test_pip_settings_come_from_the_environment_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     config = tmp_path / "pip.conf"
-    config.write_text("[global]\nindex-url = http://file.example/simple\nextra-index-url = http://a.example/s http://b.example/s\n"
-                      "[download]\ncert = /from/file.pem\n")
+    config.write_text(
+        "[global]\nindex-url = http://file.example/simple\nextra-index-url = http://a.example/s http://b.example/s\n"
+        "[download]\ncert = /from/file.pem\n"
+    )
     monkeypatch.setenv("PIP_CONFIG_FILE", str(config))
     for name in ("PIP_INDEX_URL", "PIP_CERT", "PIP_EXTRA_INDEX_URL"):
         monkeypatch.delenv(name, raising=False)

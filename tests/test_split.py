@@ -9,8 +9,14 @@ from fitting.split import split
 
 @pytest.mark.parametrize(
     ("frames", "test_frames", "train", "test"),
-    [(400, None, 300, 100), (2000, None, 1500, 500), (3000, None, 1500, 1500), (504, 150, 354, 150), (2, 1, 1, 1),
-     (4000, 500, 1500, 500)],
+    [
+        (400, None, 300, 100),
+        (2000, None, 1500, 500),
+        (3000, None, 1500, 1500),
+        (504, 150, 354, 150),
+        (2, 1, 1, 1),
+        (4000, 500, 1500, 500),
+    ],
 )
 def test_lengths_order_and_contiguity(frames: int, test_frames: int | None, train: int, test: int) -> None:
     first, last = split(frames, 0.75, 1500, test_frames)

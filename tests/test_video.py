@@ -21,8 +21,9 @@ def all_rgb(path: Path) -> np.ndarray:
 @pytest.mark.parametrize("degrees", [0, 90, 180, 270])
 def test_display_matrix_is_applied_in_all_eight_orientations(tmp_path: Path, degrees: int, hflip: bool) -> None:
     picture = video_files.quadrants()
-    path = video_files.write(tmp_path / "turned.mp4", [picture] * 4,
-                             prepare=lambda stream: stream.set_display_rotation(degrees, hflip=hflip))
+    path = video_files.write(
+        tmp_path / "turned.mp4", [picture] * 4, prepare=lambda stream: stream.set_display_rotation(degrees, hflip=hflip)
+    )
     wanted = np.rot90(picture, degrees // 90)
     wanted = wanted[:, ::-1] if hflip else wanted
     found = all_rgb(path)[0]
@@ -68,8 +69,15 @@ def test_constant_frame_rate_is_not_called_variable(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("codec", "pixel_format", "suffix"),
-    [("libx264", "yuv420p10le", "mp4"), ("libx265", "yuv420p10le", "mp4"), ("ffv1", "yuv444p10le", "mkv"),
-     ("libvpx-vp9", "yuv420p", "webm"), ("mjpeg", "yuvj420p", "avi"), ("ffv1", "gray", "mkv"), ("libx264", "yuvj420p", "mp4")],
+    [
+        ("libx264", "yuv420p10le", "mp4"),
+        ("libx265", "yuv420p10le", "mp4"),
+        ("ffv1", "yuv444p10le", "mkv"),
+        ("libvpx-vp9", "yuv420p", "webm"),
+        ("mjpeg", "yuvj420p", "avi"),
+        ("ffv1", "gray", "mkv"),
+        ("libx264", "yuvj420p", "mp4"),
+    ],
 )
 def test_bit_depths_ranges_and_codecs_give_the_same_colours(tmp_path: Path, codec: str, pixel_format: str, suffix: str) -> None:
     if codec not in av.codecs_available:

@@ -1,6 +1,6 @@
 """Check of the installation: one OpenCV, the headless contrib build, that imports and works without libGL.
 
-    python -m workflow.environment
+python -m workflow.environment
 """
 
 from __future__ import annotations

@@ -16,9 +16,9 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv")
-RESERVED_SUBJECTS = frozenset({"plots", "tables"})
+RESERVED_SUBJECTS = frozenset({"plots", "tables", "tracking_benchmark"})
 """Names under `results/` that belong to all subjects together."""
-RESERVED_VARIANTS = frozenset({"fit", "frames", "landmarks", "matte", "page", "plots", "probe", "trim"})
+RESERVED_VARIANTS = frozenset({"export", "fit", "frames", "landmarks", "matte", "page", "plots", "probe", "trim"})
 """Names under `results/{subject}/` that belong to all variants together."""
 PREDICTORS = ("mean_frame", "nearest_frame")
 """Trivial predictors that stand beside the avatars in every table."""

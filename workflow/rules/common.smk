@@ -8,8 +8,12 @@ import sys
 from functools import cache
 from pathlib import Path
 
+from snakemake.exceptions import WorkflowError
+
 from avatar.config import RenderConfig, Settings, TrainConfig
+from fitting import benchmark_settings
 from fitting.assets import ASSETS
+from fitting.config import BenchmarkConfig, SimulateConfig
 from workflow import settings as checks
 from workflow.digest import code_digest
 from workflow.settings import PREDICTORS
@@ -46,8 +50,9 @@ digest_of = cache(code_digest)
 PYTHON = shlex.quote(sys.executable)
 
 
+# A simulated clip is a subject too, but none of `all`.
 wildcard_constraints:
-    subject="|".join(map(re.escape, SUBJECTS)),
+    subject="|".join([*map(re.escape, SUBJECTS), re.escape(benchmark_settings.PREFIX) + r"[a-z]+_\d+[a-z0-9_]*"]),
     variant="|".join(map(re.escape, ALL_VARIANTS)),
     predictor="|".join(PREDICTORS),
     asset="|".join(map(re.escape, ASSETS)),
@@ -59,7 +64,7 @@ def named(paths):
     return " ".join(shlex.quote(f"{name}={path}") for name, found in pairs for path in found)
 
 
-def step(name, subject=None, device=False):
+def step(name, subject=None, device=False, one_thread=False):
     """How a rule calls a step, but for its config and code, which are parameters of their own.
 
     A function of input and output, so that none of this counts as a parameter: where the work runs, and on how many threads,
@@ -70,7 +75,8 @@ def step(name, subject=None, device=False):
         who = subject or wildcards.get("subject") or wildcards.asset
         where = f" --device {shlex.quote(SETTINGS.device)}" if device else ""
         files = f"--input {named(input)} --output {named(output)}"
-        return f"{PYTHON} -m {name} --subject {shlex.quote(who)} --threads {threads}{where} {files}"
+        count = 1 if one_thread else threads
+        return f"{PYTHON} -m {name} --subject {shlex.quote(who)} --threads {count}{where} {files}"
 
     return call
 
@@ -140,13 +146,44 @@ def content_of_head_files(wildcards):
 
 
 def video_of(wildcards):
-    """The subject's video."""
-    return str(VIDEOS[wildcards.subject])
+    """The subject's video. A user's own counts by content (see `content_of_video`), not by time."""
+    if wildcards.subject in VIDEOS:
+        return ancient(str(VIDEOS[wildcards.subject]))
+    return f"simulated/videos/{wildcards.subject.removeprefix(benchmark_settings.PREFIX)}.mp4"
 
 
 def content_of_video(wildcards):
     """Fingerprint of the video: touching or copying it changes nothing, another video does."""
-    return checks.fingerprint(VIDEOS[wildcards.subject])
+    return checks.fingerprint(VIDEOS[wildcards.subject]) if wildcards.subject in VIDEOS else "simulated"
+
+
+def simulate_config(wildcards):
+    """What the config says of simulated videos, and over it what the video's name says: KIND_SEED[_FRAMES][_HAIR]."""
+    named = {"kind": wildcards.kind, "seed": int(wildcards.seed)}
+    for word in wildcards.options.split("_")[1:]:
+        named |= {"frames": int(word)} if word.isdecimal() else {"hair": word}
+    return SimulateConfig(**SETTINGS.simulate.model_dump() | named).model_dump_json()
+
+
+def truth_of(wildcards):
+    """The truth of a simulated clip, where the head that is fitted has the same vertices."""
+    clip = wildcards.subject.removeprefix(benchmark_settings.PREFIX)
+    known = wildcards.subject not in VIDEOS and SETTINGS.head.model == "anny"
+    return {"truth": f"simulated/truth/{clip}.npz"} if known else {}
+
+
+def benchmark_config(wildcards):
+    """The setting that the file's name says, on the shipped config: the user's own fit keys do not count here."""
+    fit = benchmark_settings.SETTINGS[wildcards.setting].fit
+    frames = benchmark_settings.frames_of(wildcards.subject, wildcards.setting)
+    return BenchmarkConfig(fit=fit, frames=frames, simulated=wildcards.subject not in VIDEOS).model_dump_json()
+
+
+def benchmark_rows(wildcards):
+    """Rows of the benchmark: simulated clips, and the first of the user's own that have a face."""
+    own = list(filter(accepted, sorted(SUBJECTS)[: max(benchmark_settings.REAL_CLIPS.values())]))
+    pattern = "results/tracking_benchmark/rows/{}/{}.json"
+    return [pattern.format(*row) for row in benchmark_settings.planned(own)]
 
 
 def accepted(subject):
@@ -161,6 +198,22 @@ def page_of(subject):
     One input function per subject: one that fails in probe holds back no other.
     """
     return lambda wildcards: f"results/{subject}/page" if accepted(subject) else f"results/{subject}/probe/probe.json"
+
+
+def exportable_head(wildcards):
+    """The head model, where other programs know its codes."""
+    if SETTINGS.head.model == "anny":
+        raise WorkflowError(
+            "export: the track of the default head (head.model: anny) cannot be written as FLAME codes; "
+            "set head.model: flame and head.path, your own FLAME file, and run snakemake again"
+        )
+    return HEAD
+
+
+def export_of(subject):
+    """What `export_all` wants of a subject; a rejected one has nothing to export."""
+    exportable_head(None)
+    return f"results/{subject}/export/export.json" if accepted(subject) else []
 
 
 def training_of(wildcards):

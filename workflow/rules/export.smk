@@ -1,11 +1,11 @@
 # Tracked head -> files for other FLAME programs. Nothing else needs them: made when asked for,
 # `snakemake results/SUBJECT/export/export.json` for one subject, `snakemake export_all` for all.
-from fitting.config import ExportConfig
+# The default head is refused before anything runs.
 
 
 rule export:
     input:
-        head=HEAD,
+        head=exportable_head,
         track="results/{subject}/fit/track.npz",
         frames="results/{subject}/frames/frames.npy",
         index="results/{subject}/frames/frames.json",
@@ -20,7 +20,7 @@ rule export:
     benchmark:
         "benchmarks/{subject}/export.tsv"
     params:
-        config=lambda wildcards: getattr(SETTINGS, "export", ExportConfig()).model_dump_json(),
+        config=config_of("export"),
         code=code_of("fitting.export"),
         run=step("fitting.export"),
     shell:
@@ -30,7 +30,4 @@ rule export:
 # One input function per subject, as for pages: one that fails in probe holds back no other. A rejected one has nothing to export.
 rule export_all:
     input:
-        [
-            lambda wildcards, subject=subject: f"results/{subject}/export/export.json" if accepted(subject) else []
-            for subject in SUBJECTS
-        ],
+        [lambda wildcards, subject=subject: export_of(subject) for subject in SUBJECTS],

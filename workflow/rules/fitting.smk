@@ -3,7 +3,7 @@
 
 checkpoint probe:
     input:
-        video=ancient(video_of),
+        video=video_of,
         landmarker=asset("face_landmarker.task"),
     output:
         probe="results/{subject}/probe/probe.json",
@@ -23,7 +23,7 @@ checkpoint probe:
 
 rule extract:
     input:
-        video=ancient(video_of),
+        video=video_of,
         probe="results/{subject}/probe/probe.json",
     output:
         frames="results/{subject}/frames/frames.npy",
