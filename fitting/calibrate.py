@@ -57,7 +57,16 @@ def choose_keyframes(observed: Observed, rows: np.ndarray, poses: State, sharpne
 class _Joint:
     """The joint problem of all keyframes: a frame's own unknowns in blocks, focal length and identity shared."""
 
-    def __init__(self, model: LandmarkModel, observed: Observed, keyframes: np.ndarray, weights: Weights, log_focal: float, free: np.ndarray, extra: Extra) -> None:  # fmt: skip
+    def __init__(
+        self,
+        model: LandmarkModel,
+        observed: Observed,
+        keyframes: np.ndarray,
+        weights: Weights,
+        log_focal: float,
+        free: np.ndarray,
+        extra: Extra,
+    ) -> None:
         self.model, self.observed, self.keyframes, self.weights = model, observed, keyframes, weights
         self.log_focal, self.free, self.extra = log_focal, free, extra
 

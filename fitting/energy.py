@@ -1,6 +1,7 @@
 """The fit's energy: every term is a function from a posed surface to weighted residual rows, and one place adds them up.
 
-Pure float64 numpy.  Letters: L landmarks, M residual rows, E expression coefficients, S shape, d unknowns of a frame (fitting.rig).
+Pure float64 numpy.  Letters: L landmarks, M residual rows, E expression and S shape coefficients, d unknowns of
+a frame (fitting.rig).
 Robust costs are Huber's, by iteratively reweighted least squares.
 """
 
@@ -111,7 +112,7 @@ def landmark_rows(model: LandmarkModel, frame: Frame, weights: Weights, lens: Ca
 
 
 def eyelid_rows(model: LandmarkModel, frame: Frame, weights: Weights, lens: Camera, at: Posed) -> Rows:
-    """Gap between upper and lower lid as seen against as detected: a blink moves few landmarks by little, so it gets its own term."""
+    """Gap between the lids as seen against as detected: a blink moves few landmarks by little, so it gets its own term."""
     upper, lower = model.lids[..., 0].ravel(), model.lids[..., 1].ravel()
     seen = np.sqrt(frame.weight[upper] * frame.weight[lower] * facing(model.surface.normal[upper], at.pose))
     scale = seen / (weights.eyelid_sigma * frame.scale_px)
@@ -149,7 +150,7 @@ class Prior:
 
 
 def prior(model: LandmarkModel, frame: Frame, weights: Weights) -> Prior:
-    """The priors of one frame: expression about the blendshape scores, gaze straight ahead (held while an eye is shut), jaw shut."""
+    """The priors of one frame: expression about the scores, gaze straight ahead (held while an eye is shut), jaw shut."""
     count = len(model.low)
     size = POSE + count + GAZE + JAW
     deviation = np.ones(size)

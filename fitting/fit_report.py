@@ -50,7 +50,7 @@ def _percentiles(values: np.ndarray) -> dict[str, float]:
 
 
 def _spread(head: HeadModel, expression: np.ndarray) -> dict[str, float | str]:
-    """Standard deviation of the codes over time, mean over dimensions (the paper's supplement C), with the basis it belongs to."""
+    """Standard deviation of the codes over time, mean over dimensions (the paper's supplement C), with their basis."""
     statistical = ~np.isfinite(head.expression_high.numpy())
     out: dict[str, float | str] = {"basis": head.name, "std_mean_over_dimensions": round(float(expression.std(0).mean()), 4)}
     if statistical.any() and not statistical.all():
@@ -93,7 +93,7 @@ def _decisions(head: HeadModel, clip: Clip, fitted: Fitted, config: FitConfig) -
         decisions["light"] = f"free: it explains {100 * appearance.explained:.0f} % of the skin's change on keyframes left out"
     else:
         decisions["light"] = (
-            f"constant: a light from all sides explains only {100 * appearance.explained:.0f} % of the skin's change on keyframes left out"
+            f"constant: a directed one explains {100 * appearance.explained:.0f} % of the skin's change on keyframes left out"
         )
     return decisions
 

@@ -1,13 +1,13 @@
 """The detector's habits: how its landmarks slide over the surface with identity, expression and view.
 
-A landmark detector does not see points of a mesh: its cheek point lies elsewhere on a broad face than on a narrow one, and its
-nose tip moves forward as the head turns.  Taken as fixed points of the mesh, MediaPipe's landmarks are 3.5 mm off (rms) on renders
-of random heads, and that error passes for identity, rotation and focal length.  Most of it is linear in what the fit solves for, so
-it is learned where the truth is known: random heads of the head model itself are rendered, the detector looks at them, and a ridge
-regression explains its points.  Renders are plain grey-brown shading: only geometry is learned.
+A landmark detector does not see points of a mesh: its cheek point lies elsewhere on a broad face than on a narrow one, and
+moves as the head turns.  Taken as fixed points of the mesh, MediaPipe's landmarks are 3.6 mm off (rms) on renders of random
+heads, and that error passes for identity and rotation.  Half of it is linear in what the fit solves for, so it is learned where
+the truth is known: random heads of the head model itself are rendered, the detector looks at them, and a ridge regression
+explains its points.  Renders are plain grey-brown shading: only geometry is learned.
 
-The irises keep their place (a grey render's are no irises), and the slide with expression is regressed too but not kept: on simulated
-clips with other paint it left the lids 0.4 mm worse.
+The irises keep their place (a grey render's are no irises), and the slide with expression is regressed too but not kept: on
+simulated clips with other paint it left the lids 0.4 mm worse.
 
 Letters: N renders, L = 478 landmarks, D = 1 + S + 2 features (1, identity, view direction across and down).
 """

@@ -117,7 +117,9 @@ def read(level: Level, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return out, inside
 
 
-def visible(rig_vertices: Surface, triangles: np.ndarray, pose: Pose, lens: Camera, size: tuple[int, int], points: np.ndarray) -> np.ndarray:  # fmt: skip
+def visible(
+    rig_vertices: Surface, triangles: np.ndarray, pose: Pose, lens: Camera, size: tuple[int, int], points: np.ndarray
+) -> np.ndarray:
     """Which points [P, 3] m (camera axes) nothing of the mesh hides [P] bool.
 
     Args:
@@ -150,7 +152,9 @@ def weights_of(surface: Surface, pose: Pose, seen: np.ndarray) -> np.ndarray:
     return np.where(seen & (toward > 0.2), toward**2, 0.0)
 
 
-def photometric_rows(picture: Level, colour: np.ndarray, weight: np.ndarray, sigma: float, strength: float, lens: Camera, robust: float, at: Posed) -> Rows:  # fmt: skip
+def photometric_rows(
+    picture: Level, colour: np.ndarray, weight: np.ndarray, sigma: float, strength: float, lens: Camera, robust: float, at: Posed
+) -> Rows:
     """Difference between a frame's picture and the samples' shaded colours, gain and offset of the frame eliminated.
 
     Args:

@@ -129,7 +129,7 @@ class Pictures:
             normal = self.fold(shape)[1].normal @ pose.rotation.T
             shade = np.clip(1 + photometric.harmonics(normal) @ self.appearance.light, 0.3, None)
         rim = edge = None
-        if self.strength.silhouette:
+        if self.strength.silhouette and self.skin is not None:
             edge, whole = silhouette.edge_of(self.alpha[row]), self.fold(shape)[0]
             rim = silhouette.rim_of(self.rig, whole, pose, lens, self.size, self.frames[row], edge, self.skin, self.scale_px[row])
         return Look(weight.astype(np.float32), shade.astype(np.float32), pixel.astype(np.float32), rim, edge)

@@ -109,9 +109,11 @@ class Rig:
     def surface(self, triangles: np.ndarray, barycentric: np.ndarray) -> Surface:
         """Points at barycentric places [P, 3] of triangles [P] (numbers)."""
         corners = self.triangles[triangles]
-        mix = lambda values: sum(
-            barycentric[:, k].reshape(-1, *[1] * (values.ndim - 1)) * values[corners[:, k]] for k in range(3)
-        )  # noqa: E731
+
+        def mix(values: np.ndarray) -> np.ndarray:
+            weights = barycentric.reshape(*barycentric.shape, *[1] * (values.ndim - 1))
+            return sum(weights[:, k] * values[corners[:, k]] for k in range(3))
+
         corner = self.template[corners]
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -219,7 +221,15 @@ def jacobian(posed_points: Posed, covector: np.ndarray, point: np.ndarray) -> np
     return out
 
 
-def _joint_columns(posed_points: Posed, local: np.ndarray, at_rest: np.ndarray, point: np.ndarray, rows: np.ndarray, place: np.ndarray, out: np.ndarray) -> None:  # fmt: skip
+def _joint_columns(
+    posed_points: Posed,
+    local: np.ndarray,
+    at_rest: np.ndarray,
+    point: np.ndarray,
+    rows: np.ndarray,
+    place: np.ndarray,
+    out: np.ndarray,
+) -> None:
     """Columns of gaze and jaw, for the rows whose points hang from a joint."""
     surface, pose = posed_points.surface, posed_points.pose
     start = POSE + surface.expression_basis.shape[2]

@@ -105,7 +105,17 @@ class Rim:
     surface: Surface  # unfolded
 
 
-def rim_of(rig: Rig, whole: Surface, pose: Pose, lens: Camera, size: tuple[int, int], image: np.ndarray, edge: Edge, skin: Skin, scale_px: float) -> Rim | None:  # fmt: skip
+def rim_of(
+    rig: Rig,
+    whole: Surface,
+    pose: Pose,
+    lens: Camera,
+    size: tuple[int, int],
+    image: np.ndarray,
+    edge: Edge,
+    skin: Skin,
+    scale_px: float,
+) -> Rim | None:
     """The outline of the mesh in one frame; None where too little of it lies inside the picture.
 
     Args:

@@ -198,7 +198,9 @@ def _track(clip: Clip, config: FitConfig, tracker: stages.Tracker, bar: Bar) -> 
     return state, reinit
 
 
-def _problem(clip: Clip, tracker: stages.Tracker, pictures: Pictures | None, look: Look | None, row: int, pose: Pose, level: int) -> Problem:  # fmt: skip
+def _problem(
+    clip: Clip, tracker: stages.Tracker, pictures: Pictures | None, look: Look | None, row: int, pose: Pose, level: int
+) -> Problem:
     """All terms of one frame around a pose; those that read pixels where there is a look."""
     problem = tracker.problem(row, pose.gaze)
     if look is None:
@@ -221,7 +223,15 @@ def _refine(clip: Clip, tracker: stages.Tracker, pictures: Pictures, state: Stat
     return state.with_poses(poses), looks
 
 
-def _bundle(clip: Clip, config: FitConfig, tracker: stages.Tracker, pictures: Pictures | None, looks: dict[int, Look], state: State, cut: np.ndarray) -> State:  # fmt: skip
+def _bundle(
+    clip: Clip,
+    config: FitConfig,
+    tracker: stages.Tracker,
+    pictures: Pictures | None,
+    looks: dict[int, Look],
+    state: State,
+    cut: np.ndarray,
+) -> State:
     """Temporal terms over the training and the test part apart: no term crosses the split."""
     smoothness = settings.SMOOTHNESS.deviation(state.expression.shape[1]) / np.sqrt(config.weights.temporal)
     for part in (clip.train, clip.test):
@@ -260,7 +270,7 @@ def _usable(clip: Clip, error: np.ndarray, good: np.ndarray, cut: np.ndarray) ->
 
 
 def _hold(clip: Clip, state: State, usable: np.ndarray) -> State:
-    """Frames without a face: a short gap keeps what the bundle drew across it, a longer one takes the nearest usable frame of its part.
+    """Frames without a face: a short gap keeps what the bundle drew across it, a longer one takes the nearest usable frame.
 
     A frame that has a face but is not usable keeps its own solved pose: blurred, it is still nearer than its neighbours'.
     """

@@ -111,7 +111,7 @@ def test_report(fitted):
     assert set(report["keyframes"]) <= set(range(TRAIN))
     errors = report["reprojection_percent_of_interocular"]
     assert 0 < errors["p50"] <= errors["p90"] <= errors["p99"] < 5
-    assert {"calibrate", "track", "photometric", "bundle", "held_out", "overlay"} <= set(report["seconds_by_stage"])
+    assert {"calibrate", "track", "pixels", "bundle", "held_out", "overlay"} <= set(report["seconds_by_stage"])
     assert report["yaw_degrees"][0] < report["yaw_degrees"][1]
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 

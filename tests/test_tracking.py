@@ -99,7 +99,7 @@ def test_a_short_gap_is_drawn_across(made, fitted):
 
 
 def test_seconds_and_seams_are_reported(fitted):
-    assert {"calibrate", "appearance", "track", "photometric", "bundle", "held_out"} <= set(fitted.seconds)
+    assert {"calibrate", "appearance", "track", "pixels", "bundle", "held_out"} <= set(fitted.seconds)
     assert all(value >= 0 for value in fitted.seconds.values())
     assert set(fitted.seams) == {"before", "after"} and set(fitted.seams["after"]) == set(fitted.seams["before"])
     assert fitted.seams["after"]["largest_mm"] < fitted.seams["before"]["largest_mm"]
@@ -155,7 +155,7 @@ def test_training_pictures_alone_decide_the_light_and_the_skin(made):
 def test_each_term_can_be_left_out(made):
     clip, truth = made
     plain = tracking.fit_clip(clip, LANDMARKS_ONLY, held_out=False)
-    assert plain.pictures is None and not {"photometric", "appearance", "bundle"} & {k for k, v in plain.seconds.items() if v > 0}
+    assert plain.pictures is None and not {"pixels", "appearance", "bundle"} & {k for k, v in plain.seconds.items() if v > 0}
     assert np.isnan(plain.held_out_px).all()
     for weights in ({"photometric": 0.0}, {"silhouette": 0.0}, {"temporal": 0.0}):
         other = tracking.fit_clip(clip, of_weights(**weights), held_out=False)
@@ -219,5 +219,5 @@ def test_the_test_tail_does_not_decide_which_training_frames_are_lost(made):
     error = np.where(np.arange(FRAMES) < 10, 1.0, 3.0)
     error[5] = 1.0 * settings.LOST_OF_MEDIAN + 0.5
     assert error[5] > settings.LOST_OF_EYES * 75
-    usable = tracking._usable(clip, error, clip.train)
+    usable = tracking._usable(clip, error, clip.train, np.zeros(FRAMES, bool))
     assert np.flatnonzero(~usable).tolist() == [5]
