@@ -98,7 +98,7 @@ def _random_head(rig: Rig, random: np.random.Generator) -> tuple[np.ndarray, Pos
     """Identity [S], pose and focal length of one render: selfie distances, turns up to half a radian, a few actions at once."""
     shape = random.normal(size=rig.shape_basis.shape[2]).clip(-2, 2)
     expression = np.zeros(len(rig.low))
-    some = random.choice(len(expression), random.integers(0, 5), replace=False)
+    some = random.choice(len(expression), random.integers(0, min(5, len(expression) + 1)), replace=False)
     bounded = np.isfinite(rig.high)
     expression[some] = np.where(bounded[some], random.uniform(0, 0.9, len(some)), random.normal(size=len(some)))
     jaw = np.array([random.uniform(0, 0.2) * rig.jaw_moves, 0.0, 0.0])

@@ -24,28 +24,34 @@ def points_m(rig: Rig, state: State) -> np.ndarray:
 
 
 def seams(rig: Rig, state: State, starts: np.ndarray, usable: np.ndarray) -> dict[str, float]:
-    """How far frames jump at the starts of blocks beyond their neighbours' mean velocity.
+    """How far frames jump at the starts of blocks.
+
+    A jump is what a frame moves beyond its neighbours' mean velocity.  A head that really sets off at that frame jumps in the
+    frames around it too, so the seam is what the start jumps beyond the frames before and after it.
 
     Returns:
-        `largest_mm`, `largest_degrees` over the starts (0 without any), and the clip's own `median_mm`, `median_degrees` of the
-        same measure, for comparison.
+        `seam_mm`, `seam_degrees`: largest over the starts (0 without any); `jump_mm`, `jump_degrees`: the starts' largest jump
+        itself; `median_mm`, `median_degrees`: median jump of the clip.
     """
     points, rotation = points_m(rig, state), state.rotation
     inner = np.arange(2, len(state) - 1)
     inner = inner[usable[inner] & usable[inner - 1] & usable[inner - 2] & usable[inner + 1]]
-    if not len(inner):
-        return {"largest_mm": 0.0, "largest_degrees": 0.0, "median_mm": 0.0, "median_degrees": 0.0}
+    out = {}
     step = np.diff(points, axis=0)
-    jump = np.linalg.norm(step[inner - 1] - 0.5 * (step[inner - 2] + step[inner]), axis=-1).mean(1) * 1e3
-    turn = camera.log_rotation(rotation[1:] @ rotation[:-1].swapaxes(1, 2))
-    angle = np.degrees(np.linalg.norm(turn[inner - 1] - 0.5 * (turn[inner - 2] + turn[inner]), axis=-1))
-    at = np.isin(inner, starts)
-    return {
-        "largest_mm": float(jump[at].max(initial=0.0)),
-        "largest_degrees": float(angle[at].max(initial=0.0)),
-        "median_mm": float(np.median(jump)),
-        "median_degrees": float(np.median(angle)),
-    }
+    turn = camera.log_rotation(rotation[1:] @ rotation[:-1].swapaxes(1, 2)) if len(state) > 1 else np.zeros((0, 3))
+    for name, way, size in (
+        ("mm", step, lambda bend: 1e3 * np.linalg.norm(bend, axis=-1).mean(1)),
+        ("degrees", turn, lambda bend: np.degrees(np.linalg.norm(bend, axis=-1))),
+    ):
+        jump = np.zeros(len(state))
+        if len(inner):
+            jump[inner] = size(way[inner - 1] - 0.5 * (way[inner - 2] + way[inner]))
+        at = np.intersect1d(inner, starts)
+        beyond = jump[at] - np.maximum(jump[at - 2], jump[np.minimum(at + 2, len(state) - 1)])
+        out[f"seam_{name}"] = float(beyond.max(initial=0.0))
+        out[f"jump_{name}"] = float(jump[at].max(initial=0.0))
+        out[f"median_{name}"] = float(np.median(jump[inner])) if len(inner) else 0.0
+    return out
 
 
 def jitter(rig: Rig, state: State, usable: np.ndarray) -> dict[str, float]:

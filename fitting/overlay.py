@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from fitting import camera, raster
@@ -13,7 +14,7 @@ LANDMARK_COLOUR = np.array([60, 220, 90], np.uint8)
 def draw_mesh(
     frame: np.ndarray, vertices: np.ndarray, triangles: np.ndarray, focal_px: float, centre_px: np.ndarray, opacity: float = 0.6
 ) -> np.ndarray:
-    """Shaded mesh blended over a frame.
+    """Shaded mesh blended over a frame, drawn at half the size (a quarter of the time, and nobody sees it).
 
     Args:
         frame: [H, W, 3] uint8 RGB; vertices: [V, 3] m in camera axes.
@@ -21,11 +22,15 @@ def draw_mesh(
     Returns:
         [H, W, 3] uint8.
     """
-    picture, index = raster.shade(vertices, triangles, focal_px, centre_px, frame.shape[:2], MESH_COLOUR)
-    seen = index >= 0
-    out = frame.copy()
-    out[seen] = (1 - opacity) * frame[seen] + opacity * 255 * picture[seen]
-    return out
+    height, width = frame.shape[:2]
+    small = (-(-height // 2), -(-width // 2))
+    picture, index = raster.shade(
+        vertices, triangles, focal_px / 2, np.asarray(centre_px) / 2, small, MESH_COLOUR, background=0.0
+    )
+    cover = (index >= 0).astype(np.float32)
+    layer = cv2.resize(np.dstack([picture * cover[..., None], cover]), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+    layer = layer[:height, :width] * opacity
+    return np.clip((1 - layer[..., 3:]) * frame + 255 * layer[..., :3], 0, 255).astype(np.uint8)
 
 
 def draw_points(frame: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ CONFIG = f"""
 videos: videos
 device: cpu
 extract: {{size: 96, max_frames: {FRAMES}}}
+head: {{renders: 60}}
 variants:
   tiny: {{preset: demo, train: {{steps: 8, {SMALL}}}, render: {{max_frames: 3}}}}
 """

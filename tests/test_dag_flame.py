@@ -28,7 +28,7 @@ def test_pipeline_with_flame(tmp_path: Path, assets: Path) -> None:
     (pipeline.folder / "resources").mkdir()
     shutil.copytree(assets, pipeline.folder / "resources" / "assets")
     flame_file.write(tmp_path / "generic_model.pkl", chumpy=("shapedirs",))
-    head = f"head: {{model: flame, path: {tmp_path / 'generic_model.pkl'}, mouth_cavity: true}}\n"
+    head = f"head: {{model: flame, path: {tmp_path / 'generic_model.pkl'}, mouth_cavity: true, renders: 60}}\n"
     pipeline.write_config(CONFIG + head)
     shorten(assets / "carphone.mp4", pipeline.folder / "videos" / "ann.mp4", FRAMES)
     result = pipeline.run(TARGET, stub=False)

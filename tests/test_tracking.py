@@ -102,7 +102,7 @@ def test_seconds_and_seams_are_reported(fitted):
     assert {"calibrate", "appearance", "track", "pixels", "bundle", "held_out"} <= set(fitted.seconds)
     assert all(value >= 0 for value in fitted.seconds.values())
     assert set(fitted.seams) == {"before", "after"} and set(fitted.seams["after"]) == set(fitted.seams["before"])
-    assert fitted.seams["after"]["largest_mm"] < fitted.seams["before"]["largest_mm"]
+    assert fitted.seams["after"]["jump_mm"] < fitted.seams["before"]["jump_mm"]
 
 
 def test_twice_the_same_to_the_bit(made, fitted):
