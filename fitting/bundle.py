@@ -12,7 +12,6 @@ from dataclasses import astuple, dataclass
 import numpy as np
 import scipy.linalg
 
-from fitting import camera
 from fitting.energy import Problem, huber
 from fitting.rig import GAZE, JAW
 from fitting.state import State
@@ -64,7 +63,7 @@ def cuts(state: State, found: np.ndarray) -> np.ndarray:
     """Frames [T] bool whose pose jumps away from the frame before: a cut, or a track that was lost and found."""
     jump = np.zeros(len(state), bool)
     if len(state) > 1:
-        angle = np.degrees(np.linalg.norm(camera.log_rotation(state.rotation[1:] @ state.rotation[:-1].swapaxes(1, 2)), axis=1))
+        angle = np.degrees(np.linalg.norm(state.turns, axis=1))
         way = np.linalg.norm(np.diff(state.translation, axis=0), axis=1)
         jump[1:] = ((angle > JUMP_DEGREES) | (way > JUMP_M)) & found[1:] & found[:-1]
     return jump
@@ -75,7 +74,7 @@ def acceleration(state: State, stencil: np.ndarray) -> np.ndarray:
     flat = np.concatenate([state.translation, state.expression, state.gaze, state.jaw], 1)
     back, here, on = flat[:-2], flat[1:-1], flat[2:]
     straight = stencil[:, :1] * (back - here) + stencil[:, 2:] * (on - here)
-    turn = camera.log_rotation(state.rotation[1:] @ state.rotation[:-1].swapaxes(1, 2))
+    turn = state.turns
     turned = -stencil[:, :1] * turn[:-1] + stencil[:, 2:] * turn[1:]
     return np.concatenate([turned, straight], 1)
 

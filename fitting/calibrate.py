@@ -11,10 +11,9 @@ from fitting import camera, energy, solver, stages
 from fitting.energy import Problem, Weights
 from fitting.landmark_model import LandmarkModel
 from fitting.observed import Observed
+from fitting.pictures import Extra
 from fitting.rig import POSE, Surface, posed, shape_columns
 from fitting.state import State, neutral
-
-Extra = Callable[[State, int], "tuple[tuple[energy.Term, Surface], ...]"]  # terms of one keyframe with their unfolded surfaces
 
 
 @dataclass(frozen=True)

@@ -97,11 +97,7 @@ def track_arrays(head: HeadModel, clip: tracking.Clip, fitted: tracking.Fitted) 
     state = fitted.state
     frames = len(state)
     shape, expression = (torch.from_numpy(values.astype(np.float32)) for values in (state.shape, state.expression))
-    root = head.joints_of(shape)[0].numpy().astype(np.float64)
-    if hasattr(head, "joint_expression_basis"):
-        moved = torch.einsum("te,ed->td", expression, head.joint_expression_basis[:, 0])
-        root = root + moved.numpy().astype(np.float64)
-    root = np.broadcast_to(root, (frames, 3))
+    root = head.joints_of(shape, expression)[:, 0].numpy().astype(np.float64)
     # The solver turns about the origin, HeadModel about its root joint.
     translation = state.translation + np.einsum("tij,tj->ti", state.rotation, root) - root
     eyes = np.stack([state.pose(k).vectors[1:] for k in range(frames)])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from fitting import camera
 from fitting.rig import Rig, Surface, posed
 from fitting.state import State
 
@@ -33,15 +32,14 @@ def seams(rig: Rig, state: State, starts: np.ndarray, usable: np.ndarray) -> dic
         `seam_mm`, `seam_degrees`: largest over the starts (0 without any); `jump_mm`, `jump_degrees`: the starts' largest jump
         itself; `median_mm`, `median_degrees`: median jump of the clip.
     """
-    points, rotation = points_m(rig, state), state.rotation
+    points = points_m(rig, state)
     inner = np.arange(2, len(state) - 1)
     inner = inner[usable[inner] & usable[inner - 1] & usable[inner - 2] & usable[inner + 1]]
     out = {}
     step = np.diff(points, axis=0)
-    turn = camera.log_rotation(rotation[1:] @ rotation[:-1].swapaxes(1, 2)) if len(state) > 1 else np.zeros((0, 3))
     for name, way, size in (
         ("mm", step, lambda bend: 1e3 * np.linalg.norm(bend, axis=-1).mean(1)),
-        ("degrees", turn, lambda bend: np.degrees(np.linalg.norm(bend, axis=-1))),
+        ("degrees", state.turns, lambda bend: np.degrees(np.linalg.norm(bend, axis=-1))),
     ):
         jump = np.zeros(len(state))
         if len(inner):
@@ -62,6 +60,6 @@ def jitter(rig: Rig, state: State, usable: np.ndarray) -> dict[str, float]:
         return {"vertices_mm": 0.0, "rotation_degrees": 0.0}
     points = points_m(rig, state)
     bend = np.linalg.norm(points[inner + 1] - 2 * points[inner] + points[inner - 1], axis=-1).mean(1) * 1e3
-    turn = camera.log_rotation(state.rotation[1:] @ state.rotation[:-1].swapaxes(1, 2))
+    turn = state.turns
     angle = np.degrees(np.linalg.norm(turn[inner] - turn[inner - 1], axis=-1))
     return {"vertices_mm": float(np.median(bend)), "rotation_degrees": float(np.median(angle))}

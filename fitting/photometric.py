@@ -239,7 +239,7 @@ def _explained(values: np.ndarray, weights: np.ndarray, shapes: np.ndarray) -> f
     for basis in (None, shapes):
         albedo, light, _ = _alternate(values[learned], weights[learned], None if basis is None else basis[learned])
         known = np.where(np.isfinite(albedo), weights[kept], 0.0)
-        told = np.nan_to_num(albedo) * np.clip(1 + shapes[kept] @ light, 0.3, None)  # unknown samples weigh nothing
+        told = np.where(np.isfinite(albedo), albedo, 0.0) * np.clip(1 + shapes[kept] @ light, 0.3, None)  # these weigh nothing
         gain = (known * told * values[kept]).sum(1) / np.maximum((known * told**2).sum(1), 1e-9)
         spreads.append(np.median(np.abs(values[kept] - gain[:, None] * told)[known > 0]) if (known > 0).any() else 1.0)
     return float(1 - (spreads[1] / max(spreads[0], 1e-9)) ** 2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,13 +27,16 @@ class Strength:
     silhouette_robust: float
 
 
+Extra = Callable[[State, int], tuple[tuple[Term, Surface], ...]]  # terms of one keyframe, with their unfolded surfaces
+
+
 @dataclass(frozen=True)
 class Look:
-    """How the samples are seen in one frame."""
+    """How the samples and the mesh's outline are seen in one frame; None for a term that is off."""
 
-    weight: np.ndarray  # [P] float32, 0 where hidden
-    shade: np.ndarray  # [P] float32 light on each sample
-    pixels: np.ndarray  # [P, 2] float32
+    weight: np.ndarray | None  # [P] float32, 0 where hidden
+    shade: np.ndarray | None  # [P] float32 light on each sample
+    pixels: np.ndarray | None  # [P, 2] float32
     rim: silhouette.Rim | None  # the mesh's outline against the matte; None without the term
     edge: silhouette.Edge | None
 
@@ -41,7 +44,7 @@ class Look:
 class Pictures:
     """Frames and mattes of a clip with what was learned of them; makes terms.
 
-    `learn` must have run before `terms` gives photometric ones.
+    Photometric terms are there once `learn` has run, silhouette terms once `learn_skin` has.
     """
 
     def __init__(
@@ -97,7 +100,7 @@ class Pictures:
         seen &= photometric.inside(self.alpha[row], pixel, photometric.LEVELS[FINEST] * self.scale_px[row])
         return pixel, photometric.weights_of(samples, pose, seen)
 
-    def silhouette_extra(self, rows: Sequence[int], state: State, centre_px: np.ndarray):
+    def silhouette_extra(self, rows: Sequence[int], state: State, centre_px: np.ndarray) -> Extra:
         """Extra terms of the joint calibration (see `fitting.calibrate.refine`): the rim is found around `state`, then held."""
         lens = state.lens(centre_px)
         edges = [silhouette.edge_of(self.alpha[row]) for row in rows]
@@ -123,16 +126,15 @@ class Pictures:
 
     def look(self, row: int, pose: Pose, shape: np.ndarray, lens: Camera) -> Look:
         """Visibility and shading of the samples around a pose: worked out once a frame, they change slowly."""
-        pixel, weight = self._seen(row, pose, shape, lens)
-        shade = np.ones(len(pixel))
+        weight = shade = pixel = rim = edge = None
         if self.appearance is not None:
+            pixel, weight = (values.astype(np.float32) for values in self._seen(row, pose, shape, lens))
             normal = self.fold(shape)[1].normal @ pose.rotation.T
-            shade = np.clip(1 + photometric.harmonics(normal) @ self.appearance.light, 0.3, None)
-        rim = edge = None
+            shade = np.clip(1 + photometric.harmonics(normal) @ self.appearance.light, 0.3, None).astype(np.float32)
         if self.strength.silhouette and self.skin is not None:
             edge, whole = silhouette.edge_of(self.alpha[row]), self.fold(shape)[0]
             rim = silhouette.rim_of(self.rig, whole, pose, lens, self.size, self.frames[row], edge, self.skin, self.scale_px[row])
-        return Look(weight.astype(np.float32), shade.astype(np.float32), pixel.astype(np.float32), rim, edge)
+        return Look(weight, shade, pixel, rim, edge)
 
     def silhouette_terms(self, row: int, look: Look, shape: np.ndarray, lens: Camera) -> list[Term]:
         """The silhouette term of one frame, if it has one."""

@@ -50,10 +50,9 @@ STRENGTH = Strength(photometric=0.02, photometric_robust=3.0, silhouette=0.05, s
 
 def weights(terms: TermWeights) -> Weights:
     """Standard deviations with the terms' weights from config in them: a weight w divides a variance."""
-    root = np.sqrt(max(terms.landmarks, 1e-12))
     return replace(
         WEIGHTS,
-        landmark_sigma=WEIGHTS.landmark_sigma / root,
+        landmark_sigma=WEIGHTS.landmark_sigma / np.sqrt(terms.landmarks),
         iris=terms.irises,
         eyelid_sigma=WEIGHTS.eyelid_sigma / np.sqrt(max(terms.eyelids, 1e-12)),
         expression_sd=WEIGHTS.expression_sd / np.sqrt(max(terms.priors, 1e-12)),

@@ -43,6 +43,11 @@ class State:
         """Unknowns of one frame."""
         return Pose(*(getattr(self, name)[row] for name in PER_FRAME))
 
+    @property
+    def turns(self) -> np.ndarray:
+        """Rotation vectors [T - 1, 3] from each frame to the next."""
+        return camera.log_rotation(self.rotation[1:] @ self.rotation[:-1].swapaxes(1, 2))
+
     def frames(self, rows: slice | np.ndarray) -> State:
         """The same shared unknowns, some of the frames."""
         return replace(self, **{name: getattr(self, name)[rows] for name in PER_FRAME})

@@ -14,8 +14,8 @@ import torch
 
 from fitting.correspondence import LEFT_IRIS, RIGHT_IRIS
 from fitting.head_model import REGIONS, HeadModel
+from fitting.landmark_model import LID_PAIRS
 
-LIDS = (((386, 374), (385, 380), (387, 373)), ((159, 145), (160, 144), (158, 153)))  # upper, lower: left eye, right eye
 CORNERS = ((362, 263), (33, 133))  # of the left and right eye, towards the subject's left
 MAX_LAG_FRAMES = 5
 POSE_NAMES = ("shape", "rotation", "neck", "translation", "expression")
@@ -196,7 +196,7 @@ def aperture(head: HeadModel, vertices: np.ndarray) -> np.ndarray:
     """
     points, weight = _landmarks(head, vertices), head.skinning_weights.numpy()
     out = []
-    for joint, (first, second), pairs in zip((3, 4), CORNERS, LIDS, strict=True):
+    for joint, (first, second), pairs in zip((3, 4), CORNERS, LID_PAIRS, strict=True):
         ball = weight[:, joint] > 0.5
         middle = vertices[:, ball].mean(1) if ball.any() else np.nan
         up = np.cross((points[:, first] + points[:, second]) / 2 - middle, points[:, second] - points[:, first])

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -80,7 +81,7 @@ def fit_clip(clip: Clip, config: FitConfig, bar: Bar = lambda rows, _: rows, hel
     pictures = _pictures(clip, config)
     if pictures is not None:
         with _timed(seconds, "appearance"):
-            calibration = _look(clip, config, pictures, calibration, weights)
+            calibration = _with_silhouette(clip, config, pictures, calibration, weights)
     shared = calibration.state
     with _timed(seconds, "track"):
         tracker = stages.Tracker(
@@ -114,17 +115,12 @@ def fit_clip(clip: Clip, config: FitConfig, bar: Bar = lambda rows, _: rows, hel
     return Fitted(state, calibration, pictures, reinit, usable, cut, error, held, seams, seconds)
 
 
-class _timed:
-    """Context that adds its seconds to a table."""
-
-    def __init__(self, table: dict[str, float], name: str) -> None:
-        self.table, self.name = table, name
-
-    def __enter__(self) -> None:
-        self.start = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self.table[self.name] = self.table.get(self.name, 0.0) + time.perf_counter() - self.start
+@contextmanager
+def _timed(table: dict[str, float], name: str) -> Iterator[None]:
+    """Write the seconds of a block into a table."""
+    start = time.perf_counter()
+    yield
+    table[name] = time.perf_counter() - start
 
 
 def _solver(config: FitConfig) -> stages.Solve:
@@ -156,7 +152,9 @@ def _calibrate(clip: Clip, config: FitConfig, good: np.ndarray) -> tuple[Calibra
     return calibration, weights
 
 
-def _look(clip: Clip, config: FitConfig, pictures: Pictures, calibration: Calibration, weights: energy.Weights) -> Calibration:
+def _with_silhouette(
+    clip: Clip, config: FitConfig, pictures: Pictures, calibration: Calibration, weights: energy.Weights
+) -> Calibration:
     """Skin colour, then identity once more with the silhouette."""
     if not config.weights.silhouette:
         return calibration

@@ -239,13 +239,9 @@ def _decoded(container: av.container.InputContainer, stream: av.VideoStream) -> 
         try:
             packet = next(packets)
             yield from packet.decode()
-        except StopIteration:
-            return
-        except av.error.EOFError:
-            return
         except av.error.InvalidDataError:
             continue
-        except av.error.FFmpegError:
+        except (StopIteration, av.error.FFmpegError):  # the end, as the file or as FFmpeg says it
             return
 
 
