@@ -1,6 +1,8 @@
-"""Loss terms and their schedules (paper, section 3.3 and supplement B)."""
+"""Loss terms and their schedules (paper, section 3.3 and supplement B); the warp's own terms are in `avatar.warp`."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -9,6 +11,13 @@ PAPER_STEPS = 400_000
 SQUARED_UNTIL = 500  # of PAPER_STEPS: squared L2 first, then the L2 norm (the paper's commented-out notes)
 NORM_EPSILON = 1e-6
 WARM_UP = 8_000  # of PAPER_STEPS
+WARP_FROM = 5_000  # of PAPER_STEPS: the warp is off before
+WINDOW_OPEN = 80_000  # of PAPER_STEPS: all bands of the warp's encoding are open
+WARP_RATE = 0.1  # the warp's and its latents' learning rate (1e-4) by that of the other networks (1e-3)
+ELASTIC_WEIGHTS = (1e-4, 1e-5)
+ELASTIC_FALL = (55_000, 155_000)  # of PAPER_STEPS: Nerfies' 50k constant, then 100k of cosine, after the warp's delay
+MAGNITUDE_WEIGHT = 1e-2
+KL_WEIGHT = 1e-4  # of the conditional VAE; the paper does not say
 
 
 def scaled(point: int, steps: int) -> int:
@@ -45,6 +54,36 @@ def learning_rate(start: float, step: int, steps: int) -> float:
     a network of dead units stays white.
     """
     return start * 0.1 ** (step / steps) * min(1.0, (step + 1) / max(scaled(WARM_UP, steps), 1))
+
+
+def warp_learning_rate(start: float, step: int, steps: int) -> float:
+    """Rate of the warp and its latents: a tenth of `learning_rate`, with the same decay and rise.
+
+    start: of the other networks.
+    """
+    return WARP_RATE * learning_rate(start, step, steps)
+
+
+def warp_on(step: int, steps: int) -> bool:
+    """Whether points are warped; a schedule of fewer than 41 steps has no delay."""
+    return step >= scaled(WARP_FROM, steps)
+
+
+def warp_window(step: int, steps: int, bands: int = 6) -> float:
+    """Open bands of the warp's encoding: linear from 0 at step 0 (also Nerfies' start) to `bands` at WINDOW_OPEN."""
+    return bands * min(1.0, step * PAPER_STEPS / (steps * WINDOW_OPEN))
+
+
+def elastic_weight(step: int, steps: int) -> float:
+    """Weight of the elastic term: constant, then half a cosine down to a tenth."""
+    (first, last), (begin, end) = ELASTIC_WEIGHTS, ELASTIC_FALL
+    progress = min(max((step * PAPER_STEPS / steps - begin) / (end - begin), 0.0), 1.0)
+    return last + (first - last) * (1 + math.cos(math.pi * progress)) / 2
+
+
+def weight_of(term: str, step: int, steps: int) -> float:
+    """Weight at a step of a loss term that a representation names: elastic, magnitude (supplement A) or kl (`codes_mlp`)."""
+    return {"elastic": elastic_weight(step, steps), "magnitude": MAGNITUDE_WEIGHT, "kl": KL_WEIGHT}[term]
 
 
 def psnr(rendered: Tensor, truth: Tensor) -> float:
