@@ -14,6 +14,7 @@ from fitting.head_model import HeadModel
 # Fields of TrainConfig that the network and its sampling are made of; the rest only concerns training.
 MODEL_FIELDS = (
     "representation",
+    "sampling",
     "feature_channels",
     "uv_size",
     "static_features",
@@ -23,9 +24,15 @@ MODEL_FIELDS = (
     "neighbours",
     "bands",
     "view_bands",
+    "neighbourhood",
     "sample_step_m",
     "max_samples",
+    "coarse_samples",
+    "fine_samples",
 )
+
+
+TRAINING_ONLY = "warp."  # parameters that no file of an avatar holds: the error-correction warp is off at test
 
 
 def settings_of(config: TrainConfig) -> dict[str, Any]:
@@ -43,7 +50,8 @@ def build(settings: dict[str, Any], head: HeadModel) -> nn.Module:
 
 def content(avatar: nn.Module, settings: dict[str, Any], head: HeadModel, **more: Any) -> dict[str, Any]:
     """What an avatar file holds: tensors and plain values only, so that it loads with weights_only."""
-    return {"settings": settings, "head_digest": head.digest, "head_name": head.name, "weights": avatar.state_dict(), **more}
+    weights = {name: value for name, value in avatar.state_dict().items() if not name.startswith(TRAINING_ONLY)}
+    return {"settings": settings, "head_digest": head.digest, "head_name": head.name, "weights": weights, **more}
 
 
 def restore(stored: dict[str, Any], head: HeadModel) -> nn.Module:

@@ -17,8 +17,11 @@ from fitting.config import StepConfig
 class TrainConfig(StepConfig):
     """train: fit the avatar to the training frames."""
 
-    representation: Literal["ours_d"] = Field(
+    representation: Literal["ours_d", "ours_c", "displacement_mlp", "codes_mlp", "codes", "static"] = Field(
         "ours_d", description="Source of the vertex features; a module of `avatar/features/`."
+    )
+    sampling: Literal["shell", "hierarchical"] = Field(
+        "shell", description="One network in a shell around the mesh, or the paper's coarse and fine ones on the whole ray."
     )
     steps: int = Field(2000, ge=1, description="Optimisation steps; every schedule point scales with it.")
     seed: int = Field(0, description="Seed of every random number in training.")
@@ -35,11 +38,22 @@ class TrainConfig(StepConfig):
     neighbours: int = Field(4, ge=1, le=16, description="Vertices that a point reads.")
     bands: int = Field(10, ge=0, le=12, description="Octaves of the positional encoding of offsets to vertices.")
     view_bands: int = Field(4, ge=0, le=8, description="Octaves of the encoding of view directions.")
+    # Closed lips of nerface.mp4: see README, "Neighbours".
+    neighbourhood: Literal["surface", "free"] = Field(
+        "surface",
+        description="Which nearest vertices a point reads: those of one piece of surface (never both lips), or any.",
+    )
+    warp: bool = Field(False, description="Train with the error-correction warp of the paper's supplement A; off at test.")
     sample_step_m: float = Field(
         0.002, gt=0, le=0.05, description="Length of shell in metres that one sample of a ray stands for."
     )
     max_samples: int = Field(
         12, ge=1, le=512, description="Samples on a ray at most; a longer way through the shell takes longer steps."
+    )
+    # The paper's commented-out notes: "256 coarse 128 fine", read as samples.
+    coarse_samples: int = Field(256, ge=2, le=1024, description="Hierarchical: uniform samples on a ray, for the first network.")
+    fine_samples: int = Field(
+        128, ge=1, le=1024, description="Hierarchical: samples added where the first network saw something, for the second."
     )
 
 
@@ -77,6 +91,28 @@ class PlotConfig(StepConfig):
 
 class CompareConfig(StepConfig):
     """compare: the table and the plot of the tracking benchmark. Nothing to set; it is no part of `config.yaml`."""
+
+
+class AblationDataConfig(StepConfig):
+    """ablation_data, ablation_truth: small frames to compare feature sources on. The rule fills this in, as in the next two."""
+
+    size: int = Field(128, ge=32, le=2048, description="Longer side of the frames in pixels.")
+    test_frames: int = Field(24, ge=1, description="At most this many test frames, evenly spaced.")
+    factor: float = Field(2.0, gt=0, description="By what the codes of the second set of test frames are multiplied.")
+    trim: fitting.TrimConfig = fitting.TrimConfig()
+    simulate: fitting.SimulateConfig | None = Field(None, description="What a simulated clip was made from.")
+
+
+class AblationConfig(StepConfig):
+    """ablation: one cell, that is one training with its scores."""
+
+    train: TrainConfig = TrainConfig()
+    sample_factor: float = Field(2.0, ge=0.25, le=16, description="Samples on a ray of the render, as in `render`.")
+    factor: float = Field(2.0, gt=0, description="As in AblationDataConfig.")
+
+
+class AblationTableConfig(StepConfig):
+    """ablation_table: the table and the plot of all cells."""
 
 
 class PageConfig(StepConfig):

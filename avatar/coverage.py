@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -11,6 +12,7 @@ from scipy.spatial import cKDTree
 from avatar import shell
 from avatar.dataset import CELL, Scene, shrink_any
 from fitting.head_model import REGIONS
+from fitting.landmark_model import EYES, LIPS
 
 # Shell thickness before the mattes are seen, in metres: how far hair stands off the mesh there, or the fit is off.
 BASE_M = {
@@ -41,6 +43,20 @@ def hit_blocks(grid: shell.Grid, scene: Scene, frame: int, size: tuple[int, int]
     """[h, w] bool: blocks whose central ray meets the shell."""
     rays, shape = block_rays(scene, frame, size)
     return (shell.intervals(grid, rays.origins_m, rays.directions, 1e-6)[1] > 0).reshape(shape)
+
+
+def feature_blocks(scene: Scene, frame: int, size: tuple[int, int]) -> np.ndarray:
+    """[h, w] bool: blocks of the mouth and of the eyes in a frame of `size`, a block's width around their landmarks' hulls."""
+    shape = (-(-size[0] // CELL), -(-size[1] // CELL))
+    points = scene.head.landmarks(scene.vertices_m[scene.place[frame]]).numpy()
+    covered = np.zeros(shape, np.uint8)
+    for ids in (LIPS, EYES[: len(EYES) // 2], EYES[len(EYES) // 2 :]):
+        placed = points[list(ids)]
+        placed = placed[np.isfinite(placed).all(1)].astype(np.float64)
+        if len(placed) > 2:
+            hull = cv2.convexHull((scene.pixels_of(frame, placed) / CELL - 0.5).astype(np.float32))
+            cv2.fillConvexPoly(covered, np.round(hull).astype(np.int32), 1)
+    return ndimage.binary_dilation(covered > 0, iterations=1)
 
 
 def base_thickness(region: np.ndarray, vertices_m: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from avatar.features import Condition
 from avatar.volume import Rays
 from fitting.head_model import HeadModel
 
@@ -52,6 +54,18 @@ class Scene:
             # No neck here: the displacement must not depend on it, also not below the neck joint.
             displacement.append(head.local(shape, expression, jaw) - self.neutral_m)
         self.vertices_m, self.displacement_m = torch.cat(vertices), torch.cat(displacement)  # [T, V, 3] each
+        self.codes = torch.cat([chosen["expression"], chosen["jaw"]], 1)  # [T, D]; eyes left out, neck normalised away
+
+    def heads(self, frames: Sequence[int], device: str, training: bool = False) -> tuple[Tensor, Condition]:
+        """Posed vertices [B, V, 3] with eye pose, and what a source of features may read of these frames.
+
+        training: the scene's frames are the training frames, and each knows its place in time.
+        """
+        places = [self.place[frame] for frame in frames]
+        time = torch.tensor(places, dtype=torch.float32, device=device) / max(len(self.frames) - 1, 1) if training else None
+        neutral = self.neutral_m.to(device)
+        condition = Condition(self.displacement_m[places].to(device), self.codes[places].to(device), neutral, time)
+        return self.vertices_m[places].to(device), condition
 
     def camera_centre_m(self, frame: int) -> np.ndarray:
         """Camera centre [3] in the head frame."""
@@ -90,15 +104,22 @@ class Cells:
 
 CELL = 4
 OUTSIDE_SHARE = 0.25  # weight of shell pixels away from the matte: always white, soon learned
+FEATURE_SHARE = 0.3  # of a frame's rays that fall on mouth and eyes
 
 
-def cells_of(hit: np.ndarray, near_matte: np.ndarray) -> Cells:
+def cells_of(hit: np.ndarray, near_matte: np.ndarray, features: np.ndarray | None = None) -> Cells:
     """Where a frame's rays are drawn.
 
     hit: [h, w] bool, blocks whose rays meet the shell; near_matte: [h, w] bool, blocks at or beside opaque pixels.
+    features: [h, w] bool, blocks of mouth and eyes: they get at least FEATURE_SHARE of the rays.
     """
     rows, columns = np.nonzero(hit)
     weight = np.where(near_matte[rows, columns], 1.0, OUTSIDE_SHARE)
+    if features is not None:
+        chosen = features[rows, columns] & near_matte[rows, columns]
+        inside, outside = weight[chosen].sum(), weight[~chosen].sum()
+        if inside:
+            weight[chosen] *= max(1.0, FEATURE_SHARE / (1 - FEATURE_SHARE) * outside / inside)
     total = weight.sum()
     return Cells(columns * CELL, rows * CELL, np.cumsum(weight) / (total if total > 0 else 1))
 

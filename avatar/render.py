@@ -25,8 +25,7 @@ def load(job: step.Job) -> tuple[torch.nn.Module, Scene, list[int]]:
         avatar = build.restore(torch.load(job.input.avatar, map_location=job.device, weights_only=True), head)
     except (ValueError, RuntimeError, KeyError) as error:
         raise step.StepError(f"{job.input.avatar}: {error}; train the avatar again") from error
-    factor = job.config.sample_factor
-    avatar.step_m, avatar.max_samples = avatar.step_m / factor, round(avatar.max_samples * factor)
+    avatar.sharpen(job.config.sample_factor)
     frames = chosen_frames(step.read_json(job.input.split)["test"], job.config.max_frames)
     if not frames:
         raise step.StepError(f"{job.input.split}: there is no test frame; use a longer clip")
@@ -42,8 +41,7 @@ def render_frame(
     avatar: torch.nn.Module, scene: Scene, frame: int, size: tuple[int, int], precision: torch.dtype, device: str
 ) -> tuple[np.ndarray, int]:
     """One image [H, W, 4] uint8 (RGB on white, A opacity) and the number of field evaluations."""
-    place = scene.place[frame]
-    posed = avatar.pose(scene.vertices_m[place : place + 1].to(device), scene.displacement_m[place : place + 1].to(device))
+    posed = avatar.pose(*scene.heads([frame], device))
     rows, columns = np.mgrid[: size[0], : size[1]]
     rendered, evaluations = avatar.march(posed, scene.rays(frame, columns.ravel(), rows.ravel()), precision)
     image = torch.cat([rendered.colour, rendered.opacity[:, None]], 1).clamp(0, 1)

@@ -89,8 +89,19 @@ def make_avatar(job: step.Job, data: Data) -> nn.Module:
     thickness = coverage.measured_thickness(data.scene, data.alpha, looked_at, base)
     core = shell.core_points(neutral, vertex_normals(neutral, triangles))
     avatar.shape_shell(torch.from_numpy(thickness), torch.from_numpy(core))
+    if job.config.warp:
+        avatar.correct_errors(len(data.scene.frames))
     job.log.info("shell: %.0f to %.0f mm, median %.0f mm", *(1000 * np.quantile(thickness, (0, 1, 0.5))))
     return avatar.to(job.device)
+
+
+def make_optimiser(config: TrainConfig, avatar: nn.Module) -> torch.optim.Optimizer:
+    """Adam (paper, supplement B); the warp and its latents are a group of their own, with their own rate."""
+    parts = {False: [], True: []}
+    for name, parameter in avatar.named_parameters():
+        parts[name.startswith(build.TRAINING_ONLY)].append(parameter)
+    groups = [{"params": found, "warp": warp} for warp, found in parts.items() if found]
+    return torch.optim.Adam(groups, lr=config.learning_rate, betas=(0.9, 0.999), fused=True)
 
 
 class Batches:
@@ -100,20 +111,25 @@ class Batches:
         self.config, self.data, self.avatar = config, data, avatar
         self.cells: dict[int, Cells] = {}
 
-    def posed(self, frames: list[int], device: str):  # noqa: ANN201 - whatever the representation's `pose` returns
+    def posed(self, frames: list[int], device: str, training: bool = True):  # noqa: ANN201 - whatever `pose` returns
         """The posed heads of some frames; also finds where their rays are drawn when a frame is new."""
-        places = [self.data.scene.place[frame] for frame in frames]
-        posed = self.avatar.pose(self.data.scene.vertices_m[places].to(device), self.data.scene.displacement_m[places].to(device))
-        for frame, grid in zip(frames, posed.grids, strict=True):
+        posed = self.avatar.pose(*self.data.scene.heads(frames, device, training))
+        for place, frame in enumerate(frames):
             if frame not in self.cells:
-                hit = coverage.hit_blocks(grid, self.data.scene, frame, self.data.alpha.shape[1:])
-                near = ndimage.binary_dilation(shrink_any(self.data.alpha[frame]), iterations=2)
-                self.cells[frame] = cells_of(ndimage.binary_dilation(hit), near)
+                self.cells[frame] = self._cells(frame, posed.grids[place] if posed.grids else None)
         return posed
+
+    def _cells(self, frame: int, grid: shell.Grid | None) -> Cells:
+        """Where rays of a frame are drawn: where they meet the shell; anywhere when there is none."""
+        size = self.data.alpha.shape[1:]
+        near = ndimage.binary_dilation(shrink_any(self.data.alpha[frame]), iterations=2)
+        hit = np.ones_like(near) if grid is None else coverage.hit_blocks(grid, self.data.scene, frame, size)
+        return cells_of(ndimage.binary_dilation(hit), near, coverage.feature_blocks(self.data.scene, frame, size))
 
     def at(self, number: int, device: str):  # noqa: ANN201
         """Frames, posed heads, rays, jitter and truth [N, 4] (colour on white, opacity) of step `number`."""
         random = np.random.default_rng([self.config.seed, number])
+        torch.manual_seed(int(random.integers(2**62)))  # for the sources that draw (`codes_mlp`)
         count = min(self.config.frames_per_step, len(self.data.train))
         frames = [self.data.train[i] for i in random.choice(len(self.data.train), count, replace=False)]
         posed = self.posed(frames, device)
@@ -125,7 +141,7 @@ class Batches:
             truth.append(
                 np.concatenate([on_white(self.data.frames[frame][rows, columns], alpha), alpha[:, None] / np.float32(255)], 1)
             )
-            jitter.append(random.random((len(columns), self.config.max_samples), dtype=np.float32))
+            jitter.append(random.random((len(columns), self.avatar.jitter_width), dtype=np.float32))
         return frames, posed, rays, jitter, torch.from_numpy(np.concatenate(truth)).to(device)
 
 
@@ -137,7 +153,7 @@ def probe_psnr(batches: Batches, precision: torch.dtype, device: str) -> float:
         image = on_white(data.frames[frame][::PROBE_STRIDE, ::PROBE_STRIDE], data.alpha[frame][::PROBE_STRIDE, ::PROBE_STRIDE])
         rows, columns = np.mgrid[: image.shape[0], : image.shape[1]] * PROBE_STRIDE
         rays = data.scene.rays(frame, columns.ravel(), rows.ravel())
-        colour = batches.avatar.march(batches.posed([frame], device), rays, precision)[0].colour.cpu()
+        colour = batches.avatar.march(batches.posed([frame], device, training=False), rays, precision)[0].colour.cpu()
         values.append(losses.psnr(colour, torch.from_numpy(image.reshape(-1, 3))))
     return float(np.mean(values))
 
@@ -158,18 +174,25 @@ def optimise(job: step.Job, batches: Batches, optimiser: torch.optim.Optimizer, 
     """One step of training. Returns the loss."""
     config, parameters = job.config, [p for group in optimiser.param_groups for p in group["params"]]
     frames, posed, rays, jitter, truth = batches.at(state.step, job.device)
-    rendered, evaluations = batches.avatar.render(posed, rays, precision, jitter)
-    loss = losses.photometric(rendered.colour, truth[:, :3], state.step, config.steps)
-    if config.opacity_weight:
+    window = losses.warp_window(state.step, config.steps) if losses.warp_on(state.step, config.steps) else None
+    outcome = batches.avatar.render(posed, rays, precision, jitter, window)
+    loss = sum(losses.weight_of(name, state.step, config.steps) * value for name, value in outcome.terms.items())
+    for rendered in outcome.renders:
+        loss = loss + losses.photometric(rendered.colour, truth[:, :3], state.step, config.steps)
         loss = loss + config.opacity_weight * losses.opacity(rendered.opacity, truth[:, 3])
     for group in optimiser.param_groups:
-        group["lr"] = losses.learning_rate(config.learning_rate, state.step, config.steps)
+        rate = losses.warp_learning_rate if group["warp"] else losses.learning_rate
+        group["lr"] = rate(config.learning_rate, state.step, config.steps)
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    wrong = verdict(loss.detach(), parameters) if evaluations else ""
+    wrong = verdict(loss.detach(), parameters) if outcome.evaluations else ""
     if not wrong:
         optimiser.step()
-    state.step, state.skipped, state.evaluations = state.step + 1, state.skipped + bool(wrong), state.evaluations + evaluations
+    state.step, state.skipped, state.evaluations = (
+        state.step + 1,
+        state.skipped + bool(wrong),
+        state.evaluations + outcome.evaluations,
+    )
     state.recent.append(bool(wrong))
     if sum(state.recent) > BAD_SHARE * BAD_WINDOW:
         raise step.StepError(
@@ -206,7 +229,7 @@ def run(job: step.Job) -> None:
     data = load(job)
     found = preflight(job, data)
     avatar = make_avatar(job, data)
-    optimiser = torch.optim.Adam(avatar.parameters(), lr=job.config.learning_rate, betas=(0.9, 0.999), fused=True)
+    optimiser = make_optimiser(job.config, avatar)
     path, mark = job.final.avatar.parent / "checkpoints" / "last.pt", checkpoint.fingerprint(job)
     state = checkpoint.resume(job, path, mark, avatar, optimiser)
     loop(job, Batches(job.config, data, avatar), optimiser, state, path, mark)

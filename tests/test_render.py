@@ -33,9 +33,9 @@ def test_marching_in_blocks_equals_one_pass_over_all_samples(trained: dict[str, 
     scene, avatar = scene_and_avatar(trained)
     rows, columns = np.mgrid[:40, :40]
     rays = scene.rays(6, columns.ravel(), rows.ravel())
-    posed = avatar.pose(scene.vertices_m[:1], scene.displacement_m[:1])
+    posed = avatar.pose(*scene.heads([6], "cpu"))
     with torch.no_grad():
-        whole, evaluations = avatar.render(posed, [rays], torch.float32)
+        (whole,), _, evaluations = avatar.render(posed, [rays], torch.float32)
     monkeypatch.setattr(radiance, "RAY_CHUNK", 300)
     monkeypatch.setattr(radiance, "VOID", -1.0)  # keep every voxel: the same samples
     monkeypatch.setattr(radiance, "END", 0.0)
@@ -94,9 +94,9 @@ def test_large_expression_codes_stay_finite(trained: dict[str, Path]) -> None:
 
 def test_a_view_without_the_head_is_white(trained: dict[str, Path]) -> None:
     scene, avatar = scene_and_avatar(trained)
-    posed = avatar.pose(scene.vertices_m[:1], scene.displacement_m[:1])
+    posed = avatar.pose(*scene.heads([6], "cpu"))
     rays = scene.rays(6, np.arange(5000, 5010), np.arange(10))
     rendered, _ = avatar.march(posed, rays, torch.float32)
     assert (rendered.colour == 1).all() and (rendered.opacity == 0).all()
     with torch.no_grad():
-        assert (avatar.render(posed, [rays], torch.float32)[0].colour == 1).all()
+        assert (avatar.render(posed, [rays], torch.float32).renders[0].colour == 1).all()

@@ -1,0 +1,114 @@
+"""Where along the rays the field is asked: packed samples in the shell, or the paper's dense and hierarchical ones.
+
+Geometry without gradients, in numpy. Letters: N rays, P samples, S samples a ray.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from avatar import shell
+from avatar.volume import Rays
+
+REACH_M = 0.08  # hair and beard stand off the mesh by no more: the dense samples' margin before and behind it
+FLOOR = 1e-5  # of the weights that importance sampling follows (NeRF's), so that no stratum is ever without a chance
+
+
+class Packed(NamedTuple):
+    """P samples of the rays of several posed heads, rays in order, front to back on each."""
+
+    points_m: np.ndarray  # [P, 3] float32
+    directions: np.ndarray  # [P, 3] float32, unit
+    distance_m: np.ndarray  # [P] float32 along the ray
+    step_m: np.ndarray  # [P] float32 length that the sample stands for
+    ray: np.ndarray  # [P] int64 over all heads
+    slot: np.ndarray  # [P] int64 rank on its ray
+    closed: np.ndarray  # [P] bool: no light passes this sample
+    head: np.ndarray  # [P] int64
+
+
+def pack(rays: Rays, samples: shell.Samples, head: int = 0, first_ray: int = 0) -> Packed:
+    """Samples of one head's rays as points; first_ray: number of this head's first ray among all heads' rays."""
+    points = rays.origins_m[samples.ray] + samples.distance_m[:, None] * rays.directions[samples.ray]
+    heads = np.full(len(samples.ray), head, np.int64)
+    return Packed(points, rays.directions[samples.ray], *samples[:2], samples.ray + first_ray, *samples[3:], heads)
+
+
+def join(parts: list[Packed]) -> Packed:
+    """The samples of several heads as one batch."""
+    return Packed(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def in_shell(grid: shell.Grid, rays: Rays, step_m: float, most: int, jitter: np.ndarray | None) -> shell.Samples:
+    """Stratified samples inside the shell; a ray that ends at the core is closed. jitter: [N, most] or None."""
+    found, count, met = shell.intervals(grid, rays.origins_m, rays.directions)
+    return shell.sample(found, count, step_m, most, jitter, met)
+
+
+def bounds(vertices_m: np.ndarray, origins_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Near and far [N] m of dense sampling: the distances from the camera to the posed vertices [V, 3], and REACH_M more.
+
+    The paper leaves the bounds silent; from the posed head of each frame they hold at any distance from the camera.
+    """
+    centre = vertices_m.mean(0)
+    radius = np.linalg.norm(vertices_m - centre, axis=1).max() + REACH_M
+    away = np.linalg.norm(origins_m - centre, axis=1)
+    return np.maximum(away - radius, 0), away + radius
+
+
+def uniform(near_m: np.ndarray, far_m: np.ndarray, count: int, jitter: np.ndarray | None) -> shell.Samples:
+    """`count` stratified samples between near and far [N] of every ray; jitter: [N, count] in [0, 1) or None (middles)."""
+    offset = np.full((len(near_m), count), 0.5, np.float32) if jitter is None else jitter
+    step = (far_m - near_m) / count
+    return _flat(near_m[:, None] + (np.arange(count) + offset) * step[:, None], np.broadcast_to(step[:, None], offset.shape))
+
+
+def by_weight(
+    near_m: np.ndarray, far_m: np.ndarray, coarse_m: np.ndarray, weights: np.ndarray, count: int, jitter: np.ndarray | None
+) -> shell.Samples:
+    """The coarse samples and `count` more a ray, drawn where the coarse network saw something (NeRF, section 5.2).
+
+    near_m, far_m: [N]; coarse_m: [N, S] distances, one in each of S equal strata; weights: [N, S] of the coarse rendering.
+    jitter: [N, count] in [0, 1) or None (middles). The density is constant inside a stratum. A sample stands for the
+    stretch halfway to its neighbours, the first and last to the bounds: the steps of a ray add up to far - near.
+    """
+    strata = weights.shape[1]
+    offset = np.full((len(near_m), count), 0.5) if jitter is None else jitter
+    wanted = (np.arange(count) + offset) / count  # [N, count] rising
+    cumulative = np.cumsum(weights.astype(np.float64) + FLOOR, 1)
+    cumulative = np.concatenate([np.zeros((len(near_m), 1)), cumulative / cumulative[:, -1:]], 1)  # [N, S + 1]
+    # One search for all rays: ray n's values lie in [n, n + 1].
+    lift = np.arange(len(near_m))[:, None]
+    place = np.searchsorted((cumulative[:, 1:] + lift).ravel(), (wanted + lift).ravel(), side="right")
+    stratum = np.clip(place.reshape(wanted.shape) - lift * strata, 0, strata - 1)
+    low, high = np.take_along_axis(cumulative, stratum, 1), np.take_along_axis(cumulative, stratum + 1, 1)
+    inside = np.clip((wanted - low) / np.maximum(high - low, 1e-12), 0, 1)
+    width = (far_m - near_m)[:, None] / strata
+    distance = np.sort(np.concatenate([coarse_m, near_m[:, None] + (stratum + inside) * width], 1), 1)
+    edges = np.concatenate([near_m[:, None], (distance[:, 1:] + distance[:, :-1]) / 2, far_m[:, None]], 1)
+    return _flat(distance, np.diff(edges, axis=1))
+
+
+def median_samples(weights: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    """The sample of each ray at which half of its rendering weight is reached.
+
+    weights: [P] >= 0; ray: [P] of packed samples, in order. Returns indices into them, one for each ray that has samples.
+    """
+    if not len(ray):
+        return np.zeros(0, np.int64)
+    first = np.flatnonzero(np.diff(ray, prepend=-1))
+    last = np.append(first[1:], len(ray)) - 1
+    cumulative = np.cumsum(weights, dtype=np.float64)
+    before = np.concatenate([[0.0], cumulative])[first]
+    return np.clip(np.searchsorted(cumulative, (before + cumulative[last]) / 2), first, last)
+
+
+def _flat(distance: np.ndarray, step: np.ndarray) -> shell.Samples:
+    """Dense samples [N, S] as packed ones; none is closed and none lies at infinity."""
+    rays, count = distance.shape
+    ray, slot = np.divmod(np.arange(rays * count), max(count, 1))
+    return shell.Samples(
+        distance.astype(np.float32).ravel(), step.astype(np.float32).ravel(), ray, slot, np.zeros(len(ray), bool)
+    )
