@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 UNET_LEVELS = (8, 16, 32, 64, 128, 256)  # channels after each halving (paper, supplement B)
+DECODER_LEAST = 64  # channels below which the decoder does not go
 SLOPE = 0.2
 
 
@@ -85,6 +86,29 @@ class ResidualBlock(nn.Module):
         return functional.leaky_relu(inner + self.shortcut(maps), SLOPE)
 
 
+def enlarging_blocks(before: int, skips: list[int]) -> tuple[nn.ModuleList, nn.ModuleList]:
+    """Decoder blocks of supplement B: transposed convolutions that double the size, and the residual block after each.
+
+    before: channels of the smallest maps; they are halved block by block, down to `DECODER_LEAST`.
+    skips: for each block the channels that join after its transposed convolution.
+    """
+    up = [before]
+    for _ in skips:
+        up.append(max(up[-1] // 2, DECODER_LEAST))
+    enlarge = nn.ModuleList(nn.ConvTranspose2d(up[i], up[i + 1], 4, 2, 1) for i in range(len(skips)))
+    merge = nn.ModuleList(ResidualBlock(up[i + 1] + skips[i], up[i + 1]) for i in range(len(skips)))
+    return enlarge, merge
+
+
+def decode(maps: Tensor, enlarge: nn.ModuleList, merge: nn.ModuleList, skips: list[Tensor]) -> Tensor:
+    """maps: [B, C, h, w] through the blocks; the last of skips joins first, none are left for the last blocks."""
+    skips = list(skips)
+    for larger, block in zip(enlarge, merge, strict=True):
+        maps = functional.leaky_relu(larger(maps), SLOPE)
+        maps = block(torch.cat([maps, skips.pop()], 1) if skips else maps)
+    return maps
+
+
 class UNet(nn.Module):
     """The 6-level residual U-Net of supplement B: down 8..256, up 128, 64, 64, ... with transposed convolutions.
 
@@ -98,13 +122,8 @@ class UNet(nn.Module):
         self.halvings = len(levels)
         down = [before, *levels]
         self.down = nn.ModuleList(ResidualBlock(down[i], down[i + 1], 2) for i in range(len(levels)))
-        up = [levels[-1]]
-        for _ in levels:
-            up.append(max(up[-1] // 2, 64))
-        self.up = nn.ModuleList(nn.ConvTranspose2d(up[i], up[i + 1], 4, 2, 1) for i in range(len(levels)))
-        skips = [*reversed(levels[:-1]), 0]
-        self.merge = nn.ModuleList(ResidualBlock(up[i + 1] + skips[i], up[i + 1]) for i in range(len(levels)))
-        self.out = nn.Conv2d(up[-1], after, 1)
+        self.up, self.merge = enlarging_blocks(levels[-1], [*reversed(levels[:-1]), 0])
+        self.out = nn.Conv2d(self.up[-1].out_channels, after, 1)
 
     def forward(self, maps: Tensor) -> Tensor:
         """maps: [B, before, H, W] with H and W multiples of 2^levels. Returns [B, after, H, W].
@@ -118,7 +137,4 @@ class UNet(nn.Module):
             maps = block(maps)
             skips.append(maps)
         skips.pop()  # the bottleneck itself
-        for enlarge, block in zip(self.up, self.merge, strict=True):
-            maps = functional.leaky_relu(enlarge(maps), SLOPE)
-            maps = block(torch.cat([maps, skips.pop()], 1) if skips else maps)
-        return self.out(maps)
+        return self.out(decode(maps, self.up, self.merge, skips))

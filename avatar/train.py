@@ -129,7 +129,6 @@ class Batches:
     def at(self, number: int, device: str):  # noqa: ANN201
         """Frames, posed heads, rays, jitter and truth [N, 4] (colour on white, opacity) of step `number`."""
         random = np.random.default_rng([self.config.seed, number])
-        torch.manual_seed(int(random.integers(2**62)))  # for the sources that draw (`codes_mlp`)
         count = min(self.config.frames_per_step, len(self.data.train))
         frames = [self.data.train[i] for i in random.choice(len(self.data.train), count, replace=False)]
         posed = self.posed(frames, device)

@@ -8,7 +8,18 @@ import pytest
 import torch
 from torch import nn
 
-from avatar.layers import MLP, ResidualBlock, UNet, best_precision, encoded_size, linear_in, positional_encoding
+from avatar.layers import (
+    MLP,
+    SLOPE,
+    ResidualBlock,
+    UNet,
+    best_precision,
+    decode,
+    encoded_size,
+    enlarging_blocks,
+    linear_in,
+    positional_encoding,
+)
 
 
 def test_positional_encoding_equals_its_definition() -> None:
@@ -68,6 +79,19 @@ def test_unet_has_the_papers_channels() -> None:
 def test_unet_refuses_a_size_that_cannot_be_halved() -> None:
     with pytest.raises(ValueError, match="cannot be halved 6 times"):
         UNet(3, 8)(torch.zeros(1, 3, 48, 64))
+
+
+def test_decoder_blocks_double_the_maps_and_the_last_skip_joins_first() -> None:
+    torch.manual_seed(0)
+    blocks = [part.double() for part in enlarging_blocks(256, [5, 3, 0])]
+    assert [layer.out_channels for layer in blocks[0]] == [128, 64, 64]
+    assert [block.first.in_channels for block in blocks[1]] == [128 + 5, 64 + 3, 64]
+    start, wide, deep = (torch.randn(2, c, s, s, dtype=torch.float64) for c, s in ((256, 2), (3, 8), (5, 4)))
+    found, maps = decode(start, *blocks, [wide, deep]), start
+    for enlarge, merge, skip in zip(*blocks, (deep, wide, None), strict=True):
+        maps = nn.functional.leaky_relu(enlarge(maps), SLOPE)
+        maps = merge(maps if skip is None else torch.cat([maps, skip], 1))
+    assert found.shape == (2, 64, 16, 16) and torch.equal(found, maps)
 
 
 def test_no_strided_pointwise_convolution() -> None:
