@@ -120,7 +120,10 @@ def intervals(
 
 @numba.njit(cache=True)
 def _march(labels, voxel, origins, directions, max_length, found, count, met):  # noqa: ANN001, ANN202
-    """Amanatides-Woo traversal; neighbouring shell voxels join into one interval."""
+    """Amanatides-Woo traversal; neighbouring shell voxels join into one interval.
+
+    Voxels that a ray only touches, at an edge or a corner, count for nothing: neither the core nor a gap.
+    """
     shape = labels.shape
     cell = np.empty(3, np.int64)
     step = np.empty(3, np.int64)
@@ -162,7 +165,7 @@ def _march(labels, voxel, origins, directions, max_length, found, count, met):  
             if next_t[2] < next_t[axis]:
                 axis = 2
             after = min(max(next_t[axis], t), leave)
-            if label == CORE:
+            if label == CORE and after > t:
                 met[n] = True
                 break
             if label == SHELL and after > t:
@@ -176,7 +179,7 @@ def _march(labels, voxel, origins, directions, max_length, found, count, met):  
                 found[n, number - 1, 1] = after
                 if length >= max_length:
                     break
-            elif label != SHELL:
+            elif after > t:
                 inside = False
             t = after
             cell[axis] += step[axis]

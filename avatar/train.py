@@ -51,6 +51,9 @@ def load(job: step.Job) -> Data:
     except (ValueError, OSError, KeyError) as error:
         raise step.StepError(f"{job.input.track}: {error}") from error
     frames, alpha = np.load(job.input.frames, mmap_mode="r"), np.load(job.input.alpha, mmap_mode="r")
+    for path, pixels in ((job.input.frames, frames), (job.input.alpha, alpha)):
+        if pixels.dtype != np.uint8:
+            raise step.StepError(f"{path}: pixels of type {pixels.dtype}, expected uint8; run snakemake again")
     usable = track.get("usable", np.ones(len(frames), bool))
     train = [frame for frame in step.read_json(job.input.split)["train"] if usable[frame]]
     if len(train) < 2:

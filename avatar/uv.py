@@ -15,7 +15,7 @@ from torch.nn import functional
 
 MAIN_CHART = 0.8  # of the square's height, when there are other charts
 GUTTER = 0.012  # around each chart
-FLAT = 1e-12  # twice the UV area below which a triangle covers nothing
+FLAT = 1e-6  # twice the area in texels below which a triangle covers nothing; the coordinates' rounding makes up to 1e-10
 
 
 def rasterise(uvs: np.ndarray, uv_triangles: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 
 class Rays(NamedTuple):
@@ -40,7 +41,8 @@ def composite(
     slots = int(slot.max()) + 1 if len(slot) else 1
     place = ray * slots + slot
     padded = optical_depth.new_zeros(rays * slots).index_put((place,), optical_depth).view(rays, slots)
-    before = torch.cumsum(padded, 1) - padded
+    # The sum of those in front, never the running sum less the sample's own: beside 1e6 that difference loses what is in front.
+    before = functional.pad(torch.cumsum(padded[:, :-1], 1), (1, 0))
     weights = (torch.exp(-before) * -torch.expm1(-padded)).view(-1)
     weight = weights[place]
     dense_colour = colour.new_zeros(rays * slots, 3).index_put((place,), colour).view(rays, slots, 3)

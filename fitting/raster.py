@@ -12,6 +12,7 @@ from numba import njit
 from fitting import camera
 
 EMPTY = -1
+FLAT = 1e-5  # height over length below which triangles stored in float32 have no side of their own
 
 
 @njit(cache=True, fastmath=False)
@@ -75,13 +76,20 @@ def project(vertices: np.ndarray, focal_px: float, centre_px: np.ndarray) -> np.
 
 
 def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Area-weighted unit normals [V, 3] of one mesh [V, 3]; zero where a vertex has no area around it."""
-    corners = vertices[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    """Area-weighted unit normals [V, 3] of one mesh [V, 3].
+
+    Exactly zero where a vertex has no area around it, or where opposite triangles cancel: what is left then is rounding.
+    """
+    corners = np.asarray(vertices, np.float64)[triangles]
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(first, second)
+    scale = np.sqrt(np.einsum("fc,fc->f", first, first) * np.einsum("fc,fc->f", second, second))
     flat = triangles.T.ravel()  # bincount is ten times np.add.at
-    total = np.stack([np.bincount(flat, np.tile(normal[:, axis], 3), len(vertices)) for axis in range(3)], 1)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return total / np.where(length > 0, length, 1)
+    values = np.concatenate([normal, scale[:, None]], 1)
+    total = np.stack([np.bincount(flat, np.tile(values[:, axis], 3), len(vertices)) for axis in range(4)], 1)
+    length = np.linalg.norm(total[:, :3], axis=1, keepdims=True)
+    seen = length > FLAT * total[:, 3:]
+    return np.where(seen, total[:, :3] / np.where(seen, length, 1), 0.0)
 
 
 def shade(

@@ -9,7 +9,7 @@ from exported import flame_like
 from toy_head import toy_head, toy_images, toy_track
 
 from avatar import coverage
-from avatar.dataset import CELL, Scene, cells_of, draw, on_white, shrink_any
+from avatar.dataset import CELL, FEATURE_SHARE, Scene, cells_of, draw, on_white, shrink_any
 from fitting.head_model import HeadModel
 
 SIZE = 64
@@ -98,6 +98,13 @@ def test_draw_stays_in_its_cells_and_in_the_image() -> None:
     found = set(zip((columns // CELL).tolist(), (rows // CELL).tolist(), strict=True))
     assert found == {(5, 4), (2, 1)} and columns.max() == 21 and rows.max() == 17
     assert abs((columns // CELL == 2).mean() - 0.8) < 0.05  # beside the matte four times as often
+    eye = np.zeros((5, 6), bool)
+    eye[2, 2] = True
+    both = cells_of(np.ones((5, 6), bool), np.ones((5, 6), bool), eye)
+    chance = np.diff(both.cumulative, prepend=0)[(both.rows == 2 * CELL) & (both.columns == 2 * CELL)]
+    assert chance == pytest.approx(FEATURE_SHARE)
+    large = cells_of(np.ones((5, 6), bool), np.ones((5, 6), bool), ~eye)  # more than its share already: left as it is
+    np.testing.assert_allclose(np.diff(large.cumulative, prepend=0), 1 / 30)
     nothing = cells_of(np.zeros((5, 6), bool), near)
     assert len(draw(nothing, 10, (18, 22), np.random.default_rng(0))[0]) == 0
 
