@@ -19,6 +19,7 @@ include: "workflow/rules/avatar.smk"
 include: "workflow/rules/report.smk"
 include: "workflow/rules/simulate.smk"
 include: "workflow/rules/tracking.smk"
+include: "workflow/rules/ablation.smk"
 
 
 rule all:

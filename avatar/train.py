@@ -99,12 +99,12 @@ def make_avatar(job: step.Job, data: Data) -> nn.Module:
 
 
 def make_optimiser(config: TrainConfig, avatar: nn.Module) -> torch.optim.Optimizer:
-    """Adam (paper, supplement B); the warp and its latents are a group of their own, with their own rate."""
-    parts = {False: [], True: []}
+    """Adam (paper, supplement B) with a group of parameters for each entry of `losses.RATES` that the avatar has."""
+    groups: dict[str, list[nn.Parameter]] = {}
     for name, parameter in avatar.named_parameters():
-        parts[name.startswith(build.TRAINING_ONLY)].append(parameter)
-    groups = [{"params": found, "warp": warp} for warp, found in parts.items() if found]
-    return torch.optim.Adam(groups, lr=config.learning_rate, betas=(0.9, 0.999), fused=True)
+        groups.setdefault(losses.group_of(name), []).append(parameter)
+    chosen = [{"params": parameters, "name": name} for name, parameters in groups.items()]
+    return torch.optim.Adam(chosen, lr=config.learning_rate, betas=(0.9, 0.999), fused=True)
 
 
 class Batches:
@@ -183,8 +183,7 @@ def optimise(job: step.Job, batches: Batches, optimiser: torch.optim.Optimizer, 
         loss = loss + losses.photometric(rendered.colour, truth[:, :3], state.step, config.steps)
         loss = loss + config.opacity_weight * losses.opacity(rendered.opacity, truth[:, 3])
     for group in optimiser.param_groups:
-        rate = losses.warp_learning_rate if group["warp"] else losses.learning_rate
-        group["lr"] = rate(config.learning_rate, state.step, config.steps)
+        group["lr"] = losses.RATES[group["name"]] * losses.learning_rate(config.learning_rate, state.step, config.steps)
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
     wrong = verdict(loss.detach(), parameters) if outcome.evaluations else ""

@@ -27,19 +27,7 @@ def run(job: step.Job) -> None:
         head = HeadModel.load(job.input.head)
     except ValueError as error:
         raise step.StepError(str(error)) from None
-    lens = synthetic.Camera.of((config.height, config.width), config.focal_px, config.k1)
-    clip = synthetic.make(
-        head,
-        config.kind,
-        config.frames,
-        lens,
-        config.seed,
-        config.fps,
-        config.distance_m,
-        config.displacement_mm / 1e3,
-        config.bump_mm / 1e3,
-        exposure_stops=config.exposure_stops,
-    )
+    clip = clip_of(config, head)
     renderer = Renderer(clip, config.hair, config.noise)
     alpha = np.empty((config.frames, config.height, config.width), np.uint8)
 
@@ -54,6 +42,22 @@ def run(job: step.Job) -> None:
     with open(job.output.alpha, "wb") as file:
         np.save(file, alpha)
     job.log.info("%d frames, %.0f ms each", config.frames, 1e3 * job.seconds() / config.frames)
+
+
+def clip_of(config: SimulateConfig, rich: HeadModel) -> synthetic.Clip:
+    """The clip that a config stands for, with a head model of more components than the one that is fitted."""
+    return synthetic.make(
+        rich,
+        config.kind,
+        config.frames,
+        synthetic.Camera.of((config.height, config.width), config.focal_px, config.k1),
+        config.seed,
+        config.fps,
+        config.distance_m,
+        config.displacement_mm / 1e3,
+        config.bump_mm / 1e3,
+        exposure_stops=config.exposure_stops,
+    )
 
 
 if __name__ == "__main__":

@@ -205,7 +205,7 @@ def _closing_fully(head: HeadModel, shape: np.ndarray, expression: np.ndarray) -
     """
     out, names = expression.copy(), head.expression_names
     blinking = torch.zeros(2, len(names))
-    columns = [names.index(name) if name in names else None for name in ("eyeBlinkLeft", "eyeBlinkRight")]
+    columns = [names.index(name) if name in names else None for name in synthetic_motion.LIDS]
     for column in columns:
         if column is not None:
             blinking[1, column] = 1.0
@@ -215,6 +215,14 @@ def _closing_fully(head: HeadModel, shape: np.ndarray, expression: np.ndarray) -
         if column is not None and shut[eye] < 0 < open_[eye]:  # NaN (no landmarks) compares as False
             out[:, column] *= open_[eye] / (open_[eye] - shut[eye])
     return out
+
+
+def exaggerated(clip: Clip, factor: float) -> Clip:
+    """The clip with every expression `factor` times as strong, bumps included (blinks not: see `synthetic_motion`)."""
+    motion, names = clip.motion, clip.head.expression_names[: clip.motion.expression.shape[1]]
+    stronger = synthetic_motion.exaggerated(motion.expression, names, factor)
+    clip = replace(clip, motion=replace(motion, expression=stronger, bumps=factor * motion.bumps))
+    return replace(clip, vertices=_pose(clip))
 
 
 def _pose(clip: Clip, block: int = 64) -> np.ndarray:

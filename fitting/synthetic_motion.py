@@ -6,6 +6,7 @@ T frames, E expression coefficients.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ FAST_HZ, FAST_RAD = 1.6, np.radians(20.0)  # peak 200 degrees a second, a quick 
 NECK_SHARE = 0.25  # part of the turn that the neck joint makes: a fit that keeps the neck straight cannot copy it
 RESTING_GAZE_RAD = 0.18  # the gaze axis of the anny head passes high in the opening: this much lower, the eyes look at the camera
 BLINK_CLOSED_FRAMES = 4
+LIDS = ("eyeBlinkLeft", "eyeBlinkRight")
 # Shapes of the mouth while talking: (action, weight) each; they follow each other at four to five a second.
 VISEMES = (
     (("jawOpen", 0.45), ("mouthLowerDownLeft", 0.25), ("mouthLowerDownRight", 0.25)),  # a
@@ -140,6 +142,11 @@ def _expression(kind: str, frames: int, fps: float, names: tuple[str, ...], rand
         if "eyeSquint" + side in names:
             expression[:, names.index("eyeSquint" + side)] *= 1 - closed
     return expression.clip(0, 1)
+
+
+def exaggerated(expression: np.ndarray, names: Sequence[str], factor: float) -> np.ndarray:
+    """Expression [T, E] times `factor`, but for blinks: lids that meet cannot close any further."""
+    return expression * np.where(np.isin(names, LIDS), 1.0, factor).astype(expression.dtype)
 
 
 def blinks(kind: str, frames: int, fps: float, random: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a simulated head is painted with: everything that does not change over a clip.
+"""What a simulated head is painted with: all that does not change over a clip, and wrinkles that do.
 
 Albedo is evaluated a pixel at a time from the template coordinates under it (so that it sticks to the surface): noise and
 freckles from a periodic volume, lips, brows and lid lines from a frontal map drawn around MediaPipe's landmarks, iris and
@@ -15,9 +15,10 @@ from scipy.ndimage import gaussian_filter
 
 from fitting import raster
 from fitting.head_model import REGIONS, HeadModel
+from fitting.synthetic_wrinkles import Wrinkles, wrinkles
 
 SKIN, EYE, CLOTH, SHELL = range(4)  # kinds of triangle
-LIP, BROW, LINE, BLUSH = range(4)  # channels of the frontal map
+LIP, BROW, LINE, BLUSH, FOLD = range(5)  # channels of the frontal map
 MAP_STEP_M = 0.0004
 MAP_LOW, MAP_HIGH = np.array([-0.085, -0.075]), np.array([0.085, 0.115])  # x, y m of the template
 UPPER_BROWS, LOWER_BROWS = ((70, 63, 105, 66, 107), (300, 293, 334, 296, 336)), ((46, 53, 52, 65, 55), (276, 283, 282, 295, 285))
@@ -50,7 +51,8 @@ class Paint:
     triangles: np.ndarray  # [F', 3]
     kind: np.ndarray  # [F'] of SKIN, EYE, CLOTH, SHELL
     constant: np.ndarray  # [V', 6] float32: template coordinates (m), occlusion, shares of the mouth's inside and of the ears
-    front: np.ndarray  # [Y, X, 4] float32 frontal map
+    front: np.ndarray  # [Y, X, 5] float32 frontal map; its last channel, the wrinkles', is of a face at rest
+    wrinkles: Wrinkles
     volume: np.ndarray  # [64, 64, 64, 2] float32 periodic noise: smooth and grainy, unit variance
     torso: np.ndarray  # [N, 3] m before the translation
     shell: np.ndarray  # [N] vertex numbers of the hair shell
@@ -102,6 +104,7 @@ def paint(head: HeadModel, neutral: np.ndarray, hair: str, seed: int, shell_m: f
         ]),
         np.concatenate([constant, torso_constant, shell_constant]).astype(np.float32),
         _front_map(head, random),
+        wrinkles(head.landmarks(head.template).numpy()[:, :2], head.expression_names, MAP_LOW, MAP_STEP_M, _map_size(), seed),
         _volume(random),
         torso,
         covered,
@@ -165,12 +168,18 @@ def _volume(random: np.random.Generator, side: int = 64) -> np.ndarray:
     return np.stack([smooth / smooth.std(), grain / grain.std()], -1).astype(np.float32)
 
 
-def _front_map(head: HeadModel, random: np.random.Generator) -> np.ndarray:
-    """Lips, brows, lid lines and redness [Y, X, 4] as seen from the front of the template; zero where landmarks have no place."""
+def _map_size() -> tuple[int, int]:
+    """Y, X of the frontal map."""
     width, height = np.ceil((MAP_HIGH - MAP_LOW) / MAP_STEP_M).astype(int)
+    return int(height), int(width)
+
+
+def _front_map(head: HeadModel, random: np.random.Generator) -> np.ndarray:
+    """Lips, brows, lid lines and redness [Y, X, 5] as seen from the front of the template; zero where landmarks have no place."""
+    height, width = _map_size()
     points = head.landmarks(head.template).numpy()[:, :2]
     pixel = (points - MAP_LOW) / MAP_STEP_M
-    out = np.zeros((height, width, 4), np.float32)
+    out = np.zeros((height, width, 5), np.float32)
 
     def placed(ids: tuple[int, ...]) -> np.ndarray:
         return pixel[[k for k in ids if np.isfinite(pixel[k, 0])]]

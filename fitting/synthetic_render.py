@@ -7,7 +7,7 @@ from numba import njit
 
 from fitting import raster
 from fitting.synthetic import Clip
-from fitting.synthetic_paint import BLUSH, BROW, CLOTH, EYE, HAIRLINE_M, LINE, LIP, MAP_LOW, MAP_STEP_M, SKIN, Paint, paint
+from fitting.synthetic_paint import BLUSH, BROW, CLOTH, EYE, FOLD, HAIRLINE_M, LINE, LIP, MAP_LOW, MAP_STEP_M, SKIN, Paint, paint
 
 IRIS_M, PUPIL_M, LIMBUS_M = 0.0062, 0.0024, 0.0009
 SAMPLES = 2  # a side of each pixel
@@ -18,14 +18,18 @@ GAMMA = 1 / 2.2
 class Renderer:
     """Draws the frames of one clip."""
 
-    def __init__(self, clip: Clip, hair: str = "bald", noise: float = 0.006, samples: int = SAMPLES) -> None:
+    def __init__(
+        self, clip: Clip, hair: str = "bald", noise: float = 0.006, samples: int = SAMPLES, wrinkles: float = 1.0
+    ) -> None:
         """Prepare the paint.
 
         Args:
             hair: `bald`, `short` or `full`; noise: standard deviation of the sensor noise, part of full scale.
+            wrinkles: depth of the lines that come with expressions, as a multiple of the usual one.
         """
-        self.clip, self.noise, self.samples = clip, noise, samples
+        self.clip, self.noise, self.samples, self.wrinkles = clip, noise, samples, wrinkles
         self.paint: Paint = paint(clip.head, clip.neutral.astype(np.float64), hair, clip.seed)
+        self._front = self.paint.front.copy()
         self._hairline = np.ascontiguousarray(HAIRLINE_M)
 
     def frame(self, row: int) -> tuple[np.ndarray, np.ndarray]:
@@ -37,8 +41,9 @@ class Renderer:
         size = (height * self.samples, width * self.samples)
         index, _, bary = raster.rasterise(pixel, paint.triangles, size)
         values = np.concatenate([normals, points, paint.constant], 1).astype(np.float32)  # [V', 12]
+        self._front[..., FOLD] = self.wrinkles * paint.wrinkles.darkness(self._actions(row))
         picture = _shade(
-            index, bary, paint.triangles, paint.kind, values, paint.front, paint.volume, paint.eyes, paint.colours,
+            index, bary, paint.triangles, paint.kind, values, self._front, paint.volume, paint.eyes, paint.colours,
             self._hairline, paint.hair, paint.freckles, clip.light, self.samples,
         )  # fmt: skip
         alpha = picture[..., 3]
@@ -47,6 +52,11 @@ class Renderer:
         colour = (linear * clip.exposure[row]).clip(0, 1) ** GAMMA
         colour = colour + self.noise * random.standard_normal(colour.shape, dtype=np.float32)
         return (colour.clip(0, 1) * 255 + 0.5).astype(np.uint8), (alpha.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+    def _actions(self, row: int) -> np.ndarray:
+        """Actions [E] of a frame, and zeros for the bumps behind them: no action's name, no wrinkle."""
+        actions = self.clip.motion.expression[row]
+        return np.concatenate([actions, np.zeros(len(self.clip.head.expression_names) - len(actions))])
 
     def _mesh(self, row: int) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and normals [V', 3] of head, torso and hair shell in camera axes."""
@@ -97,7 +107,7 @@ def _look_up(front, x, y, out):
         return
     i, j = int(py), int(px)
     v, u = py - i, px - j
-    for c in range(4):
+    for c in range(front.shape[2]):
         top = front[i, j, c] * (1 - u) + front[i, j + 1, c] * u
         bottom = front[i + 1, j, c] * (1 - u) + front[i + 1, j + 1, c] * u
         out[c] = top * (1 - v) + bottom * v
@@ -121,6 +131,7 @@ def _skin(value, colours, front, volume, hairline, hair, freckles, masks, out):
         skin = colours[0, c] * (1 + 0.05 * low + 0.06 * grain + 0.03 * middle)
         skin *= 1 - redness * masks[BLUSH] * facing
         skin *= 1 - spots * (0.35 if c == 0 else 0.5)
+        skin *= 1 - masks[FOLD] * (0.9 if c == 0 else 1.0) * facing
         lip = colours[1, c] * (1 + 0.10 * grain)
         skin += (lip - skin) * masks[LIP] * facing
         skin += (colours[3, c] * 1.3 - skin) * min(1.0, 0.9 * masks[BROW]) * facing
@@ -160,7 +171,7 @@ def _shade(index, bary, triangles, kinds, values, front, volume, eyes, colours, 
     """Linear premultiplied colour and coverage [H, W, 4]: the mean of samples x samples z-buffer cells a pixel."""
     height, width = index.shape[0] // samples, index.shape[1] // samples
     out = np.zeros((height, width, 4), np.float32)
-    value, albedo, masks = np.zeros(values.shape[1]), np.zeros(3), np.zeros(4)
+    value, albedo, masks = np.zeros(values.shape[1]), np.zeros(3), np.zeros(front.shape[2])
     share = 1.0 / (samples * samples)
     for row in range(height * samples):
         for column in range(width * samples):

@@ -40,25 +40,10 @@ def run(job: step.Job) -> None:
         raise step.StepError(
             f"{job.input.track}: {len(track['usable'])} rows for {len(alpha)} mattes; delete it and run snakemake again"
         )
-    triangles = head.triangles.numpy()
-    chin = head.region.numpy() == REGIONS.index("face")
     kept, outside = [], []
     with StackWriter(job.output.alpha) as writer:
         for row in job.progress(range(len(alpha)), "trim"):
-            vertices = posed(head, track, row)
-            projected = raster.project(vertices, float(track["focal_px"]), track["centre_px"])
-            mesh = raster.rasterise(projected, triangles, alpha.shape[1:])[0] >= 0
-            down = down_axis(track["rotation"][row])
-            px_per_m = float(track["focal_px"]) / float(np.median(vertices[:, 2]))
-            trimmed = head_and_neck(
-                alpha[row],
-                mesh,
-                projected[chin, :2],
-                down,
-                job.config.neck_margin_m * px_per_m,
-                FADE_M * px_per_m,
-                MOUTH_ABOVE_CHIN_M * px_per_m,
-            )
+            trimmed, mesh = trim(head, track, row, alpha[row], job.config.neck_margin_m)
             writer.append(trimmed)
             if track["usable"][row]:
                 kept.append(float(trimmed.sum() / max(int(alpha[row].sum()), 1)))
@@ -74,6 +59,19 @@ def run(job: step.Job) -> None:
             },
         },
     )
+
+
+def trim(
+    head: HeadModel, track: dict[str, np.ndarray], row: int, alpha: np.ndarray, neck_margin_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The matte [H, W] uint8 of one frame of a track without clothes, and the pixels [H, W] bool of the mesh."""
+    vertices = posed(head, track, row)
+    projected = raster.project(vertices, float(track["focal_px"]), track["centre_px"])
+    mesh = raster.rasterise(projected, head.triangles.numpy(), alpha.shape)[0] >= 0
+    px_per_m = float(track["focal_px"]) / float(np.median(vertices[:, 2]))
+    lengths = (length * px_per_m for length in (neck_margin_m, FADE_M, MOUTH_ABOVE_CHIN_M))
+    chin = head.region.numpy() == REGIONS.index("face")
+    return head_and_neck(alpha, mesh, projected[chin, :2], down_axis(track["rotation"][row]), *lengths), mesh
 
 
 def posed(head: HeadModel, track: dict[str, np.ndarray], row: int) -> np.ndarray:

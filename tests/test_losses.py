@@ -9,12 +9,13 @@ import torch
 
 from avatar.losses import (
     MAGNITUDE_WEIGHT,
+    RATES,
     elastic_weight,
+    group_of,
     learning_rate,
     photometric,
     psnr,
     scaled,
-    warp_learning_rate,
     warp_on,
     warp_window,
 )
@@ -69,7 +70,7 @@ def test_the_papers_points_at_any_length(steps: int) -> None:
     for point, rate, window, weight in rows:
         step = scaled(point, steps)
         assert learning_rate(1e-3, step, steps) == pytest.approx(rate)
-        assert warp_learning_rate(1e-3, step, steps) == pytest.approx(rate / 10)
+        assert RATES["warp"] * learning_rate(1e-3, step, steps) == pytest.approx(rate / 10)
         assert warp_window(step, steps) == pytest.approx(window)
         assert elastic_weight(step, steps) == pytest.approx(weight)
     assert elastic_weight(0, steps) == 1e-4 and warp_window(0, steps) == 0
@@ -79,6 +80,12 @@ def test_the_warp_starts_at_its_step() -> None:
     assert [warp_on(step, PAPER) for step in (0, 4_999, 5_000, 399_999)] == [False, False, True, True]
     assert [warp_on(step, 2_000) for step in (0, 24, 25, 1_999)] == [False, False, True, True]
     assert MAGNITUDE_WEIGHT == 1e-2
+
+
+def test_every_parameter_of_an_avatar_has_a_rate() -> None:
+    names = ("field.mlp0.layers.0.weight", "coarse.density.bias", "source.static", "source.unet.out.weight", "warp.latents")
+    assert [group_of(name) for name in names] == ["field", "field", "table", "source", "warp"]
+    assert set(map(group_of, names)) == set(RATES) and RATES["field"] == 1
 
 
 def test_schedules_fall_or_rise_without_jumps() -> None:
@@ -91,8 +98,6 @@ def test_schedules_fall_or_rise_without_jumps() -> None:
 def test_a_very_short_schedule_is_sane(steps: int) -> None:
     assert warp_on(0, steps) and warp_window(0, steps) == 0 and warp_window(steps, steps) == 6
     assert elastic_weight(0, steps) == 1e-4 and elastic_weight(steps, steps) == pytest.approx(1e-5)
-    assert warp_learning_rate(1e-3, 0, steps) == pytest.approx(1e-4)
-    assert warp_learning_rate(1e-3, steps, steps) == pytest.approx(1e-5)
     assert warp_window(1, 10) == 3 and warp_window(2, 10, bands=4) == 4
 
 

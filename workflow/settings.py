@@ -16,7 +16,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv")
-RESERVED_SUBJECTS = frozenset({"plots", "tables", "tracking_benchmark"})
+RESERVED_SUBJECTS = frozenset({"ablation", "plots", "tables", "tracking_benchmark"})
 """Names under `results/` that belong to all subjects together."""
 RESERVED_VARIANTS = frozenset({"export", "fit", "frames", "landmarks", "matte", "page", "plots", "probe", "trim"})
 """Names under `results/{subject}/` that belong to all variants together."""

@@ -7,9 +7,11 @@ import shlex
 import sys
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 from snakemake.exceptions import WorkflowError
 
+from avatar import ablation_settings
 from avatar.config import RenderConfig, Settings, TrainConfig
 from fitting import benchmark_settings
 from fitting.assets import ASSETS
@@ -184,6 +186,50 @@ def benchmark_rows(wildcards):
     own = list(filter(accepted, sorted(SUBJECTS)[: max(benchmark_settings.REAL_CLIPS.values())]))
     pattern = "results/tracking_benchmark/rows/{}/{}.json"
     return [pattern.format(*row) for row in benchmark_settings.planned(own)]
+
+
+def of_simulated(content):
+    """The paths by name for a simulated subject, with its clip's name filled in; nothing for a real one."""
+
+    def paths(wildcards):
+        clip = wildcards.subject.removeprefix(benchmark_settings.PREFIX)
+        return {name: path.format(clip=clip) for name, path in content.items()} if clip != wildcards.subject else {}
+
+    return paths
+
+
+def ablation_data_config(wildcards):
+    """Size and frames, the config's trim keys, and what a simulated clip was made from."""
+    clip = re.fullmatch(rf"{re.escape(benchmark_settings.PREFIX)}([a-z]+)_(\d+)(\w*)", wildcards.subject)
+    made = clip and simulate_config(SimpleNamespace(kind=clip[1], seed=clip[2], options=clip[3]))
+    return ablation_settings.data_config(SETTINGS.trim, made).model_dump_json()
+
+
+def ablation_inputs(wildcards):
+    """What a cell trains on: tracked or true parameters, all or half of the frames; doubled codes where their truth is known."""
+    folder, group = f"results/ablation/data/{wildcards.subject}", ablation_settings.CELLS[wildcards.cell].group
+    own = {"head": f"{folder}/true_head.npz", "track": f"{folder}/true_track.npz"}
+    tracked = {"head": HEAD, "track": f"{folder}/track.npz"}
+    split = {"split": f"{folder}/{ {'half': 'half', 'overfit': 'four'}.get(group, 'split') }.json"}
+    doubled = {} if group == "overfit" else of_simulated({"doubled": f"{folder}/doubled.npz"})(wildcards)
+    return (own if group in ("true", "overfit") else tracked) | split | doubled
+
+
+def ablation_config(wildcards):
+    """The cell that the file's name says: the user's own train keys do not count here."""
+    return ablation_settings.config_of(wildcards.cell, int(wildcards.seed)).model_dump_json()
+
+
+def ablation_code(wildcards):
+    """As `model_code_of`, for the cell's representation."""
+    representation = ablation_settings.CELLS[wildcards.cell].representation
+    return digest_of("avatar.ablation", (f"avatar.features.{representation}",))
+
+
+def ablation_rows(wildcards):
+    """Rows of the simulated subject and of the user's own that have a face."""
+    pattern = "results/ablation/rows/{}/{}/{}.json"
+    return [pattern.format(*row) for row in ablation_settings.planned(list(filter(accepted, SUBJECTS)))]
 
 
 def accepted(subject):
