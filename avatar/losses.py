@@ -9,6 +9,7 @@ from torch import Tensor
 
 PAPER_STEPS = 400_000
 SQUARED_UNTIL = 500  # of PAPER_STEPS: squared L2 first, then the L2 norm (the paper's commented-out notes)
+SQUARED_LEAST = 60  # steps, where whole rays are sampled
 NORM_EPSILON = 1e-6
 WARM_UP = 8_000  # of PAPER_STEPS
 WARP_FROM = 5_000  # of PAPER_STEPS: the warp is off before
@@ -29,16 +30,26 @@ def scaled(point: int, steps: int) -> int:
     return round(point * steps / PAPER_STEPS)
 
 
-def photometric(rendered: Tensor, truth: Tensor, step: int, steps: int) -> Tensor:
-    """Mean over rays of the squared L2 distance at the start, of the L2 norm (not squared) afterwards.
+def squared_until(steps: int, whole_rays: bool) -> int:
+    """Steps of the squared distance at the start of a schedule of `steps`; whole_rays: sampled outside the shell too.
 
-    rendered, truth: [N, 3] in [0, 1]; step: 0-based; steps: length of the schedule.
+    There at least SQUARED_LEAST. The norm pulls at every wrong ray with the same strength, so that a majority of white rays
+    empties everything, and what is empty gets no gradient (toy subject, 120 steps, white is 11.2 dB: without these steps 11.2,
+    with 60 of them 17.6).
+    """
+    return max(scaled(SQUARED_UNTIL, steps), SQUARED_LEAST if whole_rays else 0)
+
+
+def photometric(rendered: Tensor, truth: Tensor, squared_loss: bool) -> Tensor:
+    """Mean over rays of the squared L2 distance (at the start), or of the L2 norm, not squared.
+
+    rendered, truth: [N, 3] in [0, 1].
     Returns a scalar; 0 for no rays.
     """
     squared = (rendered - truth).square().sum(-1)
     if not len(squared):
         return rendered.sum()
-    if step < scaled(SQUARED_UNTIL, steps):
+    if squared_loss:
         return squared.mean()
     return torch.sqrt(squared + NORM_EPSILON**2).mean()  # epsilon: the norm has no gradient at 0
 

@@ -35,6 +35,9 @@ END = 0.004  # light behind a ray's end: one level of 8 bits
 VOID = 0.01  # optical depth across a voxel below which its surroundings are skipped
 
 
+# Density's start on whole rays: softplus(CLEAR) / 3 mm over 0.6 m of air is an optical depth of 0.2. From a fog (0, -3 and -5
+# were tried, toy subject) the first thing learned is to clear it everywhere, and the network dies of it.
+CLEAR = -7.0
 CANDIDATES = 3  # times the neighbours: as many nearest vertices are looked at for mates
 DENSE_CHUNK = 512  # rays at a time of a hierarchical rendering without gradients
 
@@ -67,7 +70,11 @@ class RadianceAvatar(nn.Module):
         sizes = ("mlp_width", "mlp_depth", "colour_width", "neighbours", "bands", "view_bands")
         self.hierarchical = settings["sampling"] == "hierarchical"
         self.field = Field(source.channels, *(settings[name] for name in sizes))
-        self.coarse = Field(source.channels, *(settings[name] for name in sizes)) if self.hierarchical else None
+        self.coarse = None
+        if self.hierarchical:
+            self.coarse = Field(source.channels, *(settings[name] for name in sizes))
+            for field in (self.coarse, self.field):
+                nn.init.constant_(field.density.bias, CLEAR)
         self.coarse_samples, self.fine_samples = settings["coarse_samples"], settings["fine_samples"]
         self.step_m, self.max_samples = settings["sample_step_m"], settings["max_samples"]
         self.warp: WarpField | None = None  # of training alone: see `correct_errors`

@@ -179,8 +179,9 @@ def optimise(job: step.Job, batches: Batches, optimiser: torch.optim.Optimizer, 
     window = losses.warp_window(state.step, config.steps) if losses.warp_on(state.step, config.steps) else None
     outcome = batches.avatar.render(posed, rays, precision, jitter, window)
     loss = sum(losses.weight_of(name, state.step, config.steps) * value for name, value in outcome.terms.items())
+    squared = state.step < losses.squared_until(config.steps, config.sampling == "hierarchical")
     for rendered in outcome.renders:
-        loss = loss + losses.photometric(rendered.colour, truth[:, :3], state.step, config.steps)
+        loss = loss + losses.photometric(rendered.colour, truth[:, :3], squared)
         loss = loss + config.opacity_weight * losses.opacity(rendered.opacity, truth[:, 3])
     for group in optimiser.param_groups:
         group["lr"] = losses.RATES[group["name"]] * losses.learning_rate(config.learning_rate, state.step, config.steps)

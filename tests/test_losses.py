@@ -10,12 +10,14 @@ import torch
 from avatar.losses import (
     MAGNITUDE_WEIGHT,
     RATES,
+    SQUARED_LEAST,
     elastic_weight,
     group_of,
     learning_rate,
     photometric,
     psnr,
     scaled,
+    squared_until,
     warp_on,
     warp_window,
 )
@@ -23,24 +25,25 @@ from avatar.losses import (
 
 def test_squared_first_then_the_norm() -> None:
     rendered, truth = torch.tensor([[0.5, 0.5, 0.5], [1.0, 1.0, 1.0]]), torch.tensor([[0.5, 0.1, 0.2], [1.0, 1.0, 1.0]])
-    assert float(photometric(rendered, truth, 499, 400_000)) == pytest.approx(0.25 / 2)
-    assert float(photometric(rendered, truth, 500, 400_000)) == pytest.approx(0.5 / 2, rel=1e-5)
-    assert float(photometric(rendered, truth, 0, 100)) == pytest.approx(0.5 / 2, rel=1e-5)  # 500 of 400k is no step of 100
+    assert float(photometric(rendered, truth, True)) == pytest.approx(0.25 / 2)
+    assert float(photometric(rendered, truth, False)) == pytest.approx(0.5 / 2, rel=1e-5)
+    assert squared_until(400_000, False) == squared_until(400_000, True) == 500
+    assert squared_until(100, False) == 0 and squared_until(100, True) == SQUARED_LEAST
 
 
 def test_gradient_is_finite_where_render_equals_truth() -> None:
     rendered = torch.rand(4, 3, requires_grad=True)
-    photometric(rendered, rendered.detach().clone(), 10, 10).backward()
+    photometric(rendered, rendered.detach().clone(), False).backward()
     assert torch.isfinite(rendered.grad).all() and rendered.grad.abs().max() == 0
 
 
 def test_norm_gradient_equals_finite_differences() -> None:
     truth = torch.rand(4, 3, dtype=torch.float64)
-    torch.autograd.gradcheck(lambda x: photometric(x, truth, 10, 10), torch.rand(4, 3, dtype=torch.float64, requires_grad=True))
+    torch.autograd.gradcheck(lambda x: photometric(x, truth, False), torch.rand(4, 3, dtype=torch.float64, requires_grad=True))
 
 
 def test_no_rays_is_zero() -> None:
-    assert float(photometric(torch.empty(0, 3), torch.empty(0, 3), 10, 10)) == 0
+    assert float(photometric(torch.empty(0, 3), torch.empty(0, 3), False)) == 0
 
 
 def test_schedules() -> None:

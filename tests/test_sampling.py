@@ -111,6 +111,13 @@ def test_a_hierarchical_avatar_trains_both_networks_and_renders_the_fine_one(tmp
     assert torch.isfinite(picture.colour).all() and not torch.equal(fresh.coarse.density.weight, avatar.coarse.density.weight)
 
 
+def test_a_hierarchical_avatar_does_not_end_in_white(tmp_path: Path) -> None:
+    keys = {"coarse_samples": 16, "fine_samples": 16, "rays": 256, "mlp_width": 32, "learning_rate": 1e-3, "opacity_weight": 0.0}
+    outputs = train_in(tmp_path, write_subject(tmp_path), steps=70, sampling="hierarchical", **keys)
+    quality = [float(line.split("\t")[3]) for line in outputs["curve"].read_text().splitlines()[1:]]
+    assert quality[-1] > 14  # white is 11.2 dB, and what an avatar without the squared steps at the start becomes
+
+
 def test_both_networks_get_gradients_and_the_shell_needs_one() -> None:
     head = toy_head()
     settings = build.settings_of(TrainConfig(**(SMALL | HIERARCHICAL)))
