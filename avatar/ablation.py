@@ -38,7 +38,8 @@ def run(job: step.Job) -> None:
     row = {"load": round(os.getloadavg()[0], 2)}
     try:
         train.run(training(job, work))
-    except step.StepError as error:
+    except train.TrainingFailed as error:
+        shutil.rmtree(work)
         job.output.picture.write_bytes(pictures.png(np.full((1, 1, 3), 255, np.uint8)))
         job.write_json(job.output.row, row | {"failed": str(error)})
         return

@@ -105,4 +105,5 @@ def seeds_of(cell: str) -> tuple[int, ...]:
 def planned(real: Sequence[str]) -> list[tuple[str, str, int]]:
     """Subject, cell and seed of every row: the first seed's first. real: subjects of the user's own, with all seeds' cells."""
     rows = [(SUBJECT, cell, seed) for seed in SEEDS for cell in CELLS if seed in seeds_of(cell)]
-    return rows + [(subject, cell, SEEDS[0]) for subject in real for cell in CELLS if len(seeds_of(cell)) > 1]
+    own = [cell for cell, kind in CELLS.items() if not kind.simulated_only and seeds_of(cell) == SEEDS]
+    return rows + [(subject, cell, SEEDS[0]) for subject in real for cell in own]

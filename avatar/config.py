@@ -23,7 +23,7 @@ class TrainConfig(StepConfig):
     sampling: Literal["shell", "hierarchical"] = Field(
         "shell", description="One network in a shell around the mesh, or the paper's coarse and fine ones on the whole ray."
     )
-    steps: int = Field(2000, ge=1, description="Optimisation steps; every schedule point scales with it.")
+    steps: int = Field(2000, ge=1, description="Optimisation steps; the points of the paper's schedule scale with it.")
     seed: int = Field(0, description="Seed of every random number in training.")
     rays: int = Field(1024, ge=1, le=65536, description="Rays a step, over all its frames.")
     frames_per_step: int = Field(2, ge=1, le=64, description="Frames from which a step draws its rays.")

@@ -28,6 +28,7 @@ BASE_M = {
 LARGEST_M = 0.08
 MARGIN_M = 0.004
 SPREAD_M = 0.015  # a measured thickness holds for the vertices within this distance, because only silhouettes are measured
+FAR_BLOCKS = 1e4  # from the image's corner: beyond it a landmark is not in the picture, whatever the codes are
 PREFLIGHT_OVERLAP = 0.4
 
 
@@ -51,10 +52,12 @@ def feature_blocks(scene: Scene, frame: int, size: tuple[int, int]) -> np.ndarra
     points = scene.head.landmarks(scene.vertices_m[scene.place[frame]]).numpy()
     covered = np.zeros(shape, np.uint8)
     for ids in (LIPS, EYES[: len(EYES) // 2], EYES[len(EYES) // 2 :]):
-        placed = points[list(ids)]
-        placed = placed[np.isfinite(placed).all(1)].astype(np.float64)
-        if len(placed) > 2:
-            hull = cv2.convexHull((scene.pixels_of(frame, placed) / CELL - 0.5).astype(np.float32))
+        placed = points[list(ids)].astype(np.float64)
+        with np.errstate(all="ignore"):
+            block = scene.pixels_of(frame, placed) / CELL - 0.5
+        block = block[np.isfinite(block).all(1) & (np.abs(block) < FAR_BLOCKS).all(1)]
+        if len(block) > 2:
+            hull = cv2.convexHull(block.astype(np.float32))
             cv2.fillConvexPoly(covered, np.round(hull).astype(np.int32), 1)
     return ndimage.binary_dilation(covered > 0, iterations=1)
 

@@ -121,7 +121,8 @@ def cells_of(hit: np.ndarray, near_matte: np.ndarray, features: np.ndarray | Non
         if inside:
             weight[chosen] *= max(1.0, FEATURE_SHARE / (1 - FEATURE_SHARE) * outside / inside)
     total = weight.sum()
-    return Cells(columns * CELL, rows * CELL, np.cumsum(weight) / (total if total > 0 else 1))
+    cumulative = (np.cumsum(weight) / (total if total > 0 else 1)).astype(np.float32)
+    return Cells((columns * CELL).astype(np.int16), (rows * CELL).astype(np.int16), cumulative)  # one for every frame: small
 
 
 def draw(cells: Cells, count: int, size: tuple[int, int], random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -130,8 +131,8 @@ def draw(cells: Cells, count: int, size: tuple[int, int], random: np.random.Gene
         return np.empty(0, np.int64), np.empty(0, np.int64)
     cell = np.minimum(np.searchsorted(cells.cumulative, random.random(count)), len(cells.columns) - 1)
     within = random.integers(0, CELL, (2, count))
-    columns = np.minimum(cells.columns[cell] + within[0], size[1] - 1)
-    return columns, np.minimum(cells.rows[cell] + within[1], size[0] - 1)
+    columns = np.minimum(cells.columns[cell].astype(np.int64) + within[0], size[1] - 1)
+    return columns, np.minimum(cells.rows[cell].astype(np.int64) + within[1], size[0] - 1)
 
 
 def shrink_any(alpha: np.ndarray, threshold: int = 3) -> np.ndarray:

@@ -1,12 +1,14 @@
 """The k nearest vertices of many points, exactly: a tree on CPU, blocked brute force elsewhere; and which may be read together.
 
-Plain k-NN reads upper and lower lip at once in a fifth of the queries at a closed mouth, lid and eyeball in a tenth
-(measured on FLAME). `surface_mates` says which vertices belong together along the mesh; `keep_mates` leaves a point those
-of its candidates that belong to its nearest vertex. On CPU the tree takes 0.7 us a query in the shell on one core; a numba
-cell grid was tried and took 1.0 us.
+Plain k-NN reads upper and lower lip at once in a fifth of the queries at a closed mouth, lid and eyeball in a tenth (measured on
+FLAME), both lids in two thirds of those at a shut eye's seam (default head). `surface_mates` says which vertices belong together
+along the mesh; `keep_mates` leaves a point those of its candidates that belong to its nearest vertex. On CPU the tree takes
+0.7 us a query in the shell on one core; a numba cell grid was tried and took 1.0 us.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numba
 import numpy as np
@@ -16,9 +18,12 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from fitting.head_model import HeadModel
+
 BLOCK = 1 << 22  # pairs per block of the brute-force search
 DETOUR, SLACK_M = 3.0, 0.003  # mates: the way along the mesh is at most DETOUR times the straight one plus SLACK_M
 FARTHEST_M = 0.05  # along the mesh; vertices farther apart than this are no mates
+LIDS = ("eyeBlinkLeft", "eyeBlinkRight", "eyelid_left", "eyelid_right")  # the actions of either head model that shut the eyes
 ROWS = 512  # of the table of ways at a time
 
 
@@ -43,24 +48,32 @@ def nearest_by_blocks(vertices_m: Tensor, points_m: Tensor, k: int) -> Tensor:
     return torch.cat(found) if found else torch.empty(0, k, dtype=torch.int64, device=points_m.device)
 
 
-def surface_mates(vertices_m: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def resting_and_shut(head: HeadModel) -> tuple[np.ndarray, np.ndarray]:
+    """The template [V, 3] m, mouth closed and eyes open, and the same with its lids shut."""
+    shut = [place for place, name in enumerate(head.expression_names) if name in LIDS]
+    template = head.template.double().cpu().numpy()
+    return template, template + head.expression_basis[shut].double().cpu().numpy().sum(0)
+
+
+def surface_mates(poses_m: Sequence[np.ndarray], triangles: np.ndarray) -> np.ndarray:
     """Which vertices lie on the same piece of surface, seen from each of them.
 
-    vertices_m: [V, 3] of the head model's template; triangles: [F, 3].
-    Returns [V, V] bool, symmetric, true on the diagonal: the shortest way along edges is at most DETOUR times the straight
-    one plus SLACK_M (and FARTHEST_M). Upper and lower lip are no mates though they touch, nor are lid and eyeball.
+    poses_m: [V, 3] each, the head at rest first, then poses in which other parts of it touch; triangles: [F, 3].
+    Returns [V, V] bool, symmetric, true on the diagonal: the shortest way along edges at rest is at most DETOUR times the
+    straight one, in whichever pose that is shortest, plus SLACK_M (and FARTHEST_M). Upper and lower lip are no mates though
+    they touch, nor are the lids with each other or with the eyeball.
     """
-    count = len(vertices_m)
+    rest, count = np.asarray(poses_m[0]), len(poses_m[0])
     ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     ends = np.unique(np.sort(ends, 1), axis=0)
-    length = np.maximum(np.linalg.norm(vertices_m[ends[:, 0]] - vertices_m[ends[:, 1]], axis=1), 1e-9)  # 0 would mean no edge
+    length = np.maximum(np.linalg.norm(rest[ends[:, 0]] - rest[ends[:, 1]], axis=1), 1e-9)  # 0 would mean no edge
     graph = sparse.csr_matrix((length, (ends[:, 0], ends[:, 1])), (count, count))
     mates = np.zeros((count, count), bool)
     for start in range(0, count, ROWS):
         rows = np.arange(start, min(start + ROWS, count))
         way = dijkstra(graph, directed=False, indices=rows, limit=FARTHEST_M)
         here, there = np.nonzero(np.isfinite(way))
-        straight = np.linalg.norm(vertices_m[rows[here]] - vertices_m[there], axis=1)
+        straight = np.min([np.linalg.norm(pose[rows[here]] - pose[there], axis=1) for pose in poses_m], axis=0)
         near = way[here, there] <= DETOUR * straight + SLACK_M
         mates[rows[here[near]], there[near]] = True
     return mates

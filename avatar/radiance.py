@@ -19,9 +19,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from avatar import sampling, shell
-from avatar.features import Condition
+from avatar.features import Condition, Features
 from avatar.field import Field
-from avatar.neighbours import keep_mates, nearest_by_blocks, nearest_by_tree, surface_mates, tree_of
+from avatar.neighbours import keep_mates, nearest_by_blocks, nearest_by_tree, resting_and_shut, surface_mates, tree_of
 from avatar.sampling import Packed
 from avatar.volume import Rays, Rendered, composite
 from avatar.warp import WarpField, elastic, magnitude
@@ -79,7 +79,7 @@ class RadianceAvatar(nn.Module):
         self.step_m, self.max_samples = settings["sample_step_m"], settings["max_samples"]
         self.warp: WarpField | None = None  # of training alone: see `correct_errors`
         surface = settings["neighbourhood"] == "surface"
-        self.mates = surface_mates(head.template.double().cpu().numpy(), head.triangles.cpu().numpy()) if surface else None
+        self.mates = surface_mates(resting_and_shut(head), head.triangles.cpu().numpy()) if surface else None
         self.register_buffer("thickness_m", torch.zeros(head.vertex_count))
         self.register_buffer("core_m", torch.zeros(0, 3))
 
@@ -119,40 +119,50 @@ class RadianceAvatar(nn.Module):
         precision: torch.dtype,
         jitter: list[np.ndarray] | None = None,
         window: float | None = None,
+        features: Features | None = None,
     ) -> Outcome:
         """All rays of all posed heads in one pass with gradients.
 
         rays: one entry a head; jitter: [N, jitter_width] a head in [0, 1), None takes the middle of each stratum.
         window: of the warp's encoding (`losses.warp_window`); None leaves the warp out.
+        features: of these heads, where they are known already.
         """
-        features = self.source(posed.condition)
-        if not self.hierarchical:
-            offsets = jitter or [None] * len(rays)
-            found = [
-                sampling.in_shell(posed.grids[i], rays[i], self.step_m, self.max_samples, offsets[i]) for i in range(len(rays))
-            ]
-            rendered, _, terms = self._pass(self.field, features.values, posed, rays, found, precision, window)
-            return Outcome([rendered], features.terms | terms, sum(len(part.ray) for part in found))
-        split = self.coarse_samples
-        first = [None if jitter is None else part[:, :split] for part in jitter or rays]
-        rest = [None if jitter is None else part[:, split:] for part in jitter or rays]
-        limits = [sampling.bounds(posed.vertices_m[i].cpu().numpy(), rays[i].origins_m) for i in range(len(rays))]
-        found = [sampling.uniform(*limits[i], split, first[i]) for i in range(len(rays))]
-        rough, weights, terms = self._pass(self.coarse, features.values, posed, rays, found, precision, window)
-        weights = weights.detach().cpu().numpy().reshape(-1, split)
-        ends = np.cumsum([0, *(len(part.origins_m) for part in rays)])
+        features = self.source(posed.condition) if features is None else features
+        if self.hierarchical:
+            renders, terms, evaluations = self._coarse_to_fine(features.values, posed, rays, precision, jitter, window)
+            return Outcome(renders, features.terms | terms, evaluations)
+        offsets = jitter or [None] * len(rays)
+        found = [sampling.in_shell(posed.grids[i], rays[i], self.step_m, self.max_samples, offsets[i]) for i in range(len(rays))]
+        rendered, _, terms = self._pass(self.field, features.values, posed, rays, found, precision, window)
+        return Outcome([rendered], features.terms | terms, sum(len(part.ray) for part in found))
+
+    def _coarse_to_fine(
+        self,
+        features: Tensor,
+        posed: Posed,
+        rays: list[Rays],
+        precision: torch.dtype,
+        jitter: list[np.ndarray] | None,
+        window: float | None,
+    ) -> tuple[list[Rendered], dict[str, Tensor], int]:
+        """The coarse network at uniform samples, the fine one at these and where the first saw something. features: [B, V, C].
+
+        Returns both renderings, the warp's loss terms (of the coarse samples, as in Nerfies), and the number of evaluations.
+        """
+        split, heads = self.coarse_samples, range(len(rays))
+        first = [None if jitter is None else jitter[i][:, :split] for i in heads]
+        rest = [None if jitter is None else jitter[i][:, split:] for i in heads]
+        limits = [sampling.bounds(posed.vertices_m[i].cpu().numpy(), rays[i].origins_m) for i in heads]
+        found = [sampling.uniform(*limits[i], split, first[i]) for i in heads]
+        rough, weights, terms = self._pass(self.coarse, features, posed, rays, found, precision, window)
+        ends = np.cumsum([len(part.origins_m) for part in rays])[:-1]
+        seen = np.split(weights.detach().cpu().numpy().reshape(-1, split), ends)
         finer = [
-            sampling.by_weight(
-                *limits[i],
-                found[i].distance_m.reshape(-1, split),
-                weights[ends[i] : ends[i + 1]],
-                self.fine_samples,
-                rest[i],
-            )
-            for i in range(len(rays))
+            sampling.by_weight(*limits[i], found[i].distance_m.reshape(-1, split), seen[i], self.fine_samples, rest[i])
+            for i in heads
         ]
-        rendered, _, _ = self._pass(self.field, features.values, posed, rays, finer, precision, window, regularise=False)
-        return Outcome([rough, rendered], features.terms | terms, sum(len(part.ray) for part in found + finer))
+        rendered, _, _ = self._pass(self.field, features, posed, rays, finer, precision, window, regularise=False)
+        return [rough, rendered], terms, sum(len(part.ray) for part in found + finer)
 
     def _pass(
         self,
@@ -200,6 +210,7 @@ class RadianceAvatar(nn.Module):
         return np.concatenate(parts)
 
     def _nearest(self, posed: Posed, head: int, points: np.ndarray) -> np.ndarray:
+        points = np.where(np.isfinite(points), points, 0)  # a tree refuses others; the field makes them a loss that is not finite
         wanted = self.field.neighbours
         searched = wanted if self.mates is None else min(CANDIDATES * wanted, posed.vertices_m.shape[1])
         if posed.vertices_m.device.type == "cpu":
@@ -271,10 +282,10 @@ class RadianceAvatar(nn.Module):
 
     def _march_dense(self, posed: Posed, rays: Rays, precision: torch.dtype) -> tuple[Rendered, int]:
         """The same for hierarchical samples: every ray in full, some at a time."""
-        parts, evaluations = [], 0
-        for start in range(0, len(rays.origins_m), DENSE_CHUNK):
+        features, parts, evaluations = self.source(posed.condition), [], 0
+        for start in range(0, max(len(rays.origins_m), 1), DENSE_CHUNK):
             some = Rays(*(array[start : start + DENSE_CHUNK] for array in rays))
-            outcome = self.render(posed, [some], precision)
+            outcome = self.render(posed, [some], precision, features=features)
             parts.append(outcome.renders[-1])
             evaluations += outcome.evaluations
         return Rendered(*(torch.cat(column).cpu() for column in zip(*parts, strict=True))), evaluations

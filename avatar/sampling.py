@@ -12,7 +12,7 @@ import numpy as np
 from avatar import shell
 from avatar.volume import Rays
 
-REACH_M = 0.08  # hair and beard stand off the mesh by no more: the dense samples' margin before and behind it
+MARGIN_M = 0.08  # hair and beard stand off the mesh by no more (as `coverage.LARGEST_M`)
 FLOOR = 1e-5  # of the weights that importance sampling follows (NeRF's), so that no stratum is ever without a chance
 
 
@@ -48,12 +48,14 @@ def in_shell(grid: shell.Grid, rays: Rays, step_m: float, most: int, jitter: np.
 
 
 def bounds(vertices_m: np.ndarray, origins_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Near and far [N] m of dense sampling: the distances from the camera to the posed vertices [V, 3], and REACH_M more.
+    """Near and far [N] m of dense sampling, for rays from `origins_m` [N, 3]: where a sphere around the head begins and ends.
 
+    The sphere holds the posed vertices [V, 3] and MARGIN_M more; like the shell it ends at `shell.REACH_M` whatever the codes.
     The paper leaves the bounds silent; from the posed head of each frame they hold at any distance from the camera.
     """
-    centre = vertices_m.mean(0)
-    radius = np.linalg.norm(vertices_m - centre, axis=1).max() + REACH_M
+    within = np.clip(vertices_m.astype(np.float64), -shell.REACH_M, shell.REACH_M)
+    centre = within.mean(0)
+    radius = np.linalg.norm(within - centre, axis=1).max() + MARGIN_M
     away = np.linalg.norm(origins_m - centre, axis=1)
     return np.maximum(away - radius, 0), away + radius
 

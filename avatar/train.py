@@ -30,6 +30,10 @@ LOOKED_AT = 24  # training frames whose mattes shape the shell
 BAD_SHARE = 0.01  # of the last BAD_WINDOW steps
 
 
+class TrainingFailed(step.StepError):
+    """The data or the settings do not let this avatar be trained; another try would end the same way."""
+
+
 @dataclass
 class Data:
     """Everything a step of training reads; frames stay on disk."""
@@ -75,7 +79,7 @@ def preflight(job: step.Job, data: Data) -> float:
     chosen = data.train[:: max(1, len(data.train) // 8)]
     found = float(np.median([coverage.overlap(data.scene, data.alpha[frame], frame) for frame in chosen]))
     if found < coverage.PREFLIGHT_OVERLAP:
-        raise step.StepError(
+        raise TrainingFailed(
             f"{job.input.track}: the fitted mesh covers the matte with an overlap of only {found:.2f} (at least "
             f"{coverage.PREFLIGHT_OVERLAP} is needed); look at fit/overlay.mp4 and trim/alpha.npy"
         )
@@ -160,16 +164,17 @@ def probe_psnr(batches: Batches, precision: torch.dtype, device: str) -> float:
     return float(np.mean(values))
 
 
-def verdict(loss: Tensor, parameters: list[nn.Parameter]) -> str:
-    """What is wrong with a step after its backward pass, or an empty string.
+def verdict(loss: Tensor, parameters: list[nn.Parameter], evaluations: int) -> str:
+    """What is wrong with a step after its backward pass, or an empty string. evaluations: of the field, 0 when no ray met it.
 
     Dead: most parameters get no gradient at all, which is how a network whose units have all died by too large steps looks
     (seen at a learning rate of 3e-3: everything turns white and stays so).
     """
-    norms = torch.stack(torch._foreach_norm([parameter.grad for parameter in parameters if parameter.grad is not None]))
-    if not (torch.isfinite(loss) and torch.isfinite(norms).all()):
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    largest = torch.stack(torch._foreach_norm(gradients, float("inf"))) if gradients else loss.new_zeros(1)
+    if not (torch.isfinite(loss) and torch.isfinite(largest).all()):
         return "a loss or gradient that is not finite"
-    return "no gradient at all: the network is dead" if (norms == 0).float().mean() > 0.5 else ""
+    return "no gradient at all: the network is dead" if evaluations and (largest == 0).float().mean() > 0.5 else ""
 
 
 def optimise(job: step.Job, batches: Batches, optimiser: torch.optim.Optimizer, state: State, precision: torch.dtype) -> float:
@@ -187,8 +192,8 @@ def optimise(job: step.Job, batches: Batches, optimiser: torch.optim.Optimizer, 
         group["lr"] = losses.RATES[group["name"]] * losses.learning_rate(config.learning_rate, state.step, config.steps)
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    wrong = verdict(loss.detach(), parameters) if outcome.evaluations else ""
-    if not wrong:
+    wrong = verdict(loss.detach(), parameters, outcome.evaluations)
+    if not wrong and outcome.evaluations:  # where no ray meets the head there is nothing to learn, and momentum does not go on
         optimiser.step()
     state.step, state.skipped, state.evaluations = (
         state.step + 1,
@@ -197,7 +202,7 @@ def optimise(job: step.Job, batches: Batches, optimiser: torch.optim.Optimizer, 
     )
     state.recent.append(bool(wrong))
     if sum(state.recent) > BAD_SHARE * BAD_WINDOW:
-        raise step.StepError(
+        raise TrainingFailed(
             f"training diverges at step {state.step}: {sum(state.recent)} of the last {len(state.recent)} steps had {wrong}, "
             f"the last on frames {frames}; lower train.learning_rate"
         )

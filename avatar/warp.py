@@ -190,8 +190,8 @@ def right_singular_vectors(matrices: Tensor) -> Tensor:
 def elastic(jacobian: Tensor) -> Tensor:
     """Nerfies' elastic term, its ICCV form: 2 x / (x + 4) with x = sum_k log(max(s_k, 1e-6))^2 / c^2, s the singular values.
 
-    jacobian: [P, 3, 3]. Returns [P] in [0, 2]: 0 for rotations and reflections. Sum over a ray with its rendering weights
-    (without gradient), then take the mean over rays.
+    jacobian: [P, 3, 3]. Returns [P] in [0, 2]: 0 for rotations and reflections. The caller takes the mean over
+    one sample a ray, where half of its rendering weight is reached: Nerfies' reduction `median`.
     s_k = |J v_k| with v_k held constant: its gradient u_k v_k^T is that of s_k, and no difference of singular values is
     divided by, so that of a symmetric function of them is right where they are equal too.
     """

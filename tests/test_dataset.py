@@ -104,7 +104,7 @@ def test_draw_stays_in_its_cells_and_in_the_image() -> None:
     chance = np.diff(both.cumulative, prepend=0)[(both.rows == 2 * CELL) & (both.columns == 2 * CELL)]
     assert chance == pytest.approx(FEATURE_SHARE)
     large = cells_of(np.ones((5, 6), bool), np.ones((5, 6), bool), ~eye)  # more than its share already: left as it is
-    np.testing.assert_allclose(np.diff(large.cumulative, prepend=0), 1 / 30)
+    np.testing.assert_allclose(np.diff(large.cumulative, prepend=0), 1 / 30, rtol=1e-5)
     nothing = cells_of(np.zeros((5, 6), bool), near)
     assert len(draw(nothing, 10, (18, 22), np.random.default_rng(0))[0]) == 0
 

@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from avatar.neighbours import DETOUR, FARTHEST_M, SLACK_M, keep_mates, nearest_by_tree, surface_mates, tree_of
+import numpy as np
+from toy_head import toy_head
+
+from avatar.neighbours import (
+    DETOUR,
+    FARTHEST_M,
+    SLACK_M,
+    keep_mates,
+    nearest_by_tree,
+    resting_and_shut,
+    surface_mates,
+    tree_of,
+)
 
 
 def strips(gap_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -24,7 +36,7 @@ def strips(gap_m: float) -> tuple[np.ndarray, np.ndarray]:
 
 def test_touching_strips_are_mates_at_the_joint_alone() -> None:
     vertices, triangles = strips(0.0005)
-    mates = surface_mates(vertices, triangles)
+    mates = surface_mates([vertices], triangles)
     assert (mates == mates.T).all() and mates.diagonal().all()
     across = mates[:60, 60:]
     facing = across.diagonal()  # a vertex and the one that it touches
@@ -45,19 +57,33 @@ def test_mates_equal_a_loop_over_all_ways() -> None:
         way = np.minimum(way, way[:, [middle]] + way[[middle]])
     straight = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1)
     expected = (way <= DETOUR * straight + SLACK_M) & (way <= FARTHEST_M)
-    np.testing.assert_array_equal(surface_mates(vertices, triangles), expected)
+    np.testing.assert_array_equal(surface_mates([vertices], triangles), expected)
 
 
 def test_coincident_vertices_and_flat_triangles_do_no_harm() -> None:
     vertices, triangles = strips(0.0)
-    mates = surface_mates(vertices, np.concatenate([triangles, [[5, 5, 8], [7, 7, 7]]]))
+    mates = surface_mates([vertices], np.concatenate([triangles, [[5, 5, 8], [7, 7, 7]]]))
     assert mates.diagonal().all() and not mates[45, 105]  # touching, 15 rows from the joint
+
+
+def test_lids_that_only_touch_when_shut_are_no_mates() -> None:
+    opened, triangles = strips(0.009)  # open eyes: the rims are 9 mm apart, the way around the corner is not three times that
+    shut = opened.copy()
+    shut[60:, 1] = 0.0005
+    rim, other = 3 * 2, 60 + 3 * 2
+    assert surface_mates([opened], triangles)[rim, other] and not surface_mates([opened, shut], triangles)[rim, other]
+    head = toy_head()
+    rest, same = resting_and_shut(head)
+    assert np.array_equal(rest, same)  # a head without lids
+    named = replace(head, expression_names=("eyeBlinkLeft", "jawOpen", "eyelid_right"))
+    moved = resting_and_shut(named)[1] - rest
+    np.testing.assert_allclose(moved, head.expression_basis[[0, 2]].double().sum(0), atol=1e-12)
 
 
 def test_kept_candidates_are_mates_of_the_nearest_in_order() -> None:
     random = np.random.default_rng(0)
     vertices, triangles = strips(0.001)
-    mates = surface_mates(vertices, triangles)
+    mates = surface_mates([vertices], triangles)
     points = vertices[random.integers(0, 120, 200)] + random.normal(size=(200, 3)) * 0.0007
     index = nearest_by_tree(tree_of(vertices), points, 12)
     kept = keep_mates(index, mates, 4)
@@ -71,7 +97,7 @@ def test_kept_candidates_are_mates_of_the_nearest_in_order() -> None:
 
 def test_a_closed_mouth_reads_one_lip_at_a_time() -> None:
     vertices, triangles = strips(0.0005)
-    mates = surface_mates(vertices, triangles)
+    mates = surface_mates([vertices], triangles)
     random = np.random.default_rng(0)
     points = vertices[random.integers(30, 60, 300)] + [0, 0.0002, 0] + random.normal(size=(300, 3)) * 0.0005
     lip = lambda index: index >= 60  # noqa: E731
