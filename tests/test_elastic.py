@@ -46,6 +46,13 @@ ELASTIC_CASES = {
 }
 
 
+def test_the_naive_gradient_breaks_where_singular_values_are_equal() -> None:
+    jacobian = torch.eye(3).requires_grad_()
+    u, s, vt = torch.linalg.svd(jacobian)
+    ((u * s.log()) @ vt).square().sum().backward()  # the matrix logarithm by singular vectors
+    assert not torch.isfinite(jacobian.grad).all()
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ELASTIC_CASES)
 def test_elastic_and_its_gradient_equal_the_twin(name: str, dtype: torch.dtype) -> None:

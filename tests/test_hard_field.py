@@ -232,7 +232,7 @@ def test_flipped_and_flat_triangles_give_the_same_map() -> None:
     torch.testing.assert_close(other.at_vertices(other.to_map(attribute)), plain.at_vertices(plain.to_map(attribute)))
 
 
-def unfilled(uv: UVMap, uvs: Tensor, uv_triangles: Tensor, maps: Tensor) -> Tensor:
+def unfilled(uv: UVMap, maps: Tensor) -> Tensor:
     """The naive map: texels outside the chart are 0."""
     size = maps.shape[-1]
     inside = np.zeros((size, size), bool)
@@ -260,7 +260,7 @@ def test_no_step_across_a_seam(size: int) -> None:
     left, right = (torch.stack([read[:, (uv.copy_vertex == v).nonzero()[i, 0]] for v in seam.nonzero()[:, 0]]) for i in (0, 1))
     texel = 20 * RADII_M[0] * 2 * np.pi / size  # of the steepest attribute; each copy may read a filled texel, one off
     assert (left - right).abs().max() < 2 * texel / 0.96
-    naive = uv.at_vertices(unfilled(uv, head.uvs, head.uv_triangles, maps))
+    naive = uv.at_vertices(unfilled(uv, maps))
     assert (naive - smooth).abs()[0].amax(1)[seam].max() > 0.2
 
 

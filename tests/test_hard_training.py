@@ -153,15 +153,16 @@ def test_odd_size_and_a_principal_point_off_the_middle(inputs: dict[str, Path], 
     assert np.mean((window - truth) ** 2) < min(turned)
 
 
-@pytest.mark.parametrize("code", [10.0, 1e36])
+@pytest.mark.parametrize(("code", "sampling"), [(10.0, "shell"), (1e36, "shell"), (10.0, "hierarchical"), (1e12, "hierarchical")])
 def test_a_wild_but_finite_code_in_one_training_frame_does_not_spoil_the_others(
-    inputs: dict[str, Path], tmp_path: Path, code: float
+    inputs: dict[str, Path], tmp_path: Path, code: float, sampling: str
 ) -> None:
-    """A lost frame: at 10 a head of bumps, at 1e36 one that is out of reach and has no rays. No step is bad for it."""
+    """A lost frame: at 10 a head of bumps, beyond it one that is out of reach. No step is bad for it."""
     track = dict(np.load(inputs["track"]))
     track["expression"][2] = code
     np.savez(tmp_path / "track.npz", **track)
     keys = {"representation": "ours_d", "static_features": True, "frames_per_step": 6, "rays": 60}
+    keys |= {"sampling": sampling, "coarse_samples": 6, "fine_samples": 6}
     outputs = train_in(tmp_path, inputs | {"track": tmp_path / "track.npz"}, steps=3, **(TINY | keys))
     weights = torch.load(outputs["avatar"], weights_only=True)["weights"]
     assert report_of(outputs)["skipped_steps"] == 0 and np.isfinite(curve_of(outputs)).all()

@@ -149,12 +149,41 @@ def test_a_pose_that_is_not_finite_stops_with_its_number(inputs: dict[str, Path]
         train_in(tmp_path, inputs | {"track": tmp_path / "track.npz"}, steps=2)
 
 
-def test_frames_without_a_matte_and_all_background_batches_do_no_harm(inputs: dict[str, Path], tmp_path: Path) -> None:
-    alpha = np.load(inputs["alpha"])
-    alpha[[1, 3]] = 0
+@pytest.mark.parametrize("part", [2, 4])
+def test_frames_without_a_matte_and_all_background_batches_do_no_harm(inputs: dict[str, Path], tmp_path: Path, part: int) -> None:
+    """Two of four frames without a matte, both in every step; then four of four but for the first look at the mesh."""
+    split, alpha = tmp_path / "split.json", np.load(inputs["alpha"])
+    split.write_text(json.dumps({"train": [1, 3, 0, 2], "test": [7]}))
+    alpha[[1, 3, 0, 2][:part]] = 0
     np.save(tmp_path / "alpha.npy", alpha)
-    outputs = train_in(tmp_path, inputs | {"alpha": tmp_path / "alpha.npy"}, steps=3)
-    assert json.loads(outputs["report"].read_text())["skipped_steps"] == 0
+    changed = inputs | {"alpha": tmp_path / "alpha.npy", "split": split}
+    if part == 4:
+        with pytest.raises(StepError, match="overlap of only"):
+            train_in(tmp_path, changed, steps=1)
+        return
+    for sampling in ("shell", "hierarchical"):
+        keys = {"sampling": sampling, "coarse_samples": 6, "fine_samples": 6, "frames_per_step": 4}
+        outputs = train_in(tmp_path / sampling, changed, steps=3, **keys)
+        assert json.loads(outputs["report"].read_text())["skipped_steps"] == 0
+        assert all(torch.isfinite(value).all() for value in weights(outputs["avatar"]).values())
+
+
+@pytest.mark.parametrize("what", ["coarse", "warp"])
+def test_a_forward_pass_that_is_not_finite_names_its_frames(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """NaN weights of the coarse network place the fine samples, a NaN latent moves the points: no tree is asked for those."""
+    original = train.make_avatar
+
+    def poisoned(*arguments: object) -> torch.nn.Module:
+        avatar = original(*arguments)
+        torch.nn.init.constant_(avatar.coarse.density.bias if what == "coarse" else avatar.warp.latents, float("nan"))
+        return avatar
+
+    monkeypatch.setattr(train, "make_avatar", poisoned)
+    keys = {"coarse": {"sampling": "hierarchical", "coarse_samples": 6, "fine_samples": 6}, "warp": {"warp": True}}[what]
+    with pytest.raises(train.TrainingFailed, match=r"not finite, the last on frames \["):
+        train_in(tmp_path, inputs, steps=6, **keys)
 
 
 def test_too_few_frames_and_mismatched_sizes(inputs: dict[str, Path], tmp_path: Path) -> None:

@@ -147,6 +147,13 @@ def test_turns_of_every_size(size: float, dtype: torch.dtype) -> None:
             assert float(gradient[k]) == pytest.approx((ahead - behind) / 2e-6, abs=1e-5 if dtype == torch.float32 else 1e-9)
 
 
+def test_the_naive_turn_has_no_gradient_at_zero() -> None:
+    turn = torch.zeros(3, requires_grad=True)
+    angle = turn.norm()
+    (torch.sin(angle) * turn / angle.clamp_min(1e-8)).sum().backward()  # the formula with a clamp instead of a series
+    assert not torch.allclose(turn.grad, torch.ones(3))
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-20, 1e-8, 0.49999, 0.50001, math.pi / 2, math.pi])
 def test_tangents_of_turns_and_their_gradients(size: float) -> None:
     torch.manual_seed(0)
