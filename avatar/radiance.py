@@ -14,32 +14,22 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from avatar import sampling, shell
+from avatar import marching, sampling, shell
 from avatar.features import Condition, Features
 from avatar.field import Field
 from avatar.neighbours import keep_mates, nearest_by_blocks, nearest_by_tree, resting_and_shut, surface_mates, tree_of
 from avatar.sampling import Packed
-from avatar.volume import Rays, Rendered, composite
+from avatar.volume import CLOSED, Rays, Rendered, composite
 from avatar.warp import WarpField, elastic, magnitude
 from fitting.head_model import HeadModel
-
-RAY_CHUNK = 16384
-SLOT_BLOCK = 4
-FIELD_CHUNK = 4096
-CLOSED = 20.0  # optical depth where a ray ends at the core: the head is opaque, white never shines through it
-END = 0.004  # light behind a ray's end: one level of 8 bits
-VOID = 0.01  # optical depth across a voxel below which its surroundings are skipped
-
 
 # Density's start on whole rays: softplus(CLEAR) / 3 mm over 0.6 m of air is an optical depth of 0.2. From a fog (0, -3 and -5
 # were tried, toy subject) the first thing learned is to clear it everywhere, and the network dies of it.
 CLEAR = -7.0
 CANDIDATES = 3  # times the neighbours: as many nearest vertices are looked at for mates
-DENSE_CHUNK = 512  # rays at a time of a hierarchical rendering without gradients
 
 
 @dataclass
@@ -206,110 +196,21 @@ class RadianceAvatar(nn.Module):
         """Neighbours [P, K] of points of several heads, into the vertices of all of them."""
         count = posed.vertices_m.shape[1]
         ends = np.searchsorted(packed.head, np.arange(len(posed.trees) + 1))
-        parts = [self._nearest(posed, i, points_m[ends[i] : ends[i + 1]]) + i * count for i in range(len(posed.trees))]
+        parts = [self.nearest(posed, i, points_m[ends[i] : ends[i + 1]]) + i * count for i in range(len(posed.trees))]
         return np.concatenate(parts)
 
-    def _nearest(self, posed: Posed, head: int, points: np.ndarray) -> np.ndarray:
-        points = np.where(np.isfinite(points), points, 0)  # a tree refuses others; the field makes them a loss that is not finite
+    def march(self, posed: Posed, rays: Rays, precision: torch.dtype) -> tuple[Rendered, int]:
+        """Render the first posed head without gradients: N rays and the number of field evaluations."""
+        return marching.march(self, posed, rays, precision)
+
+    def nearest(self, posed: Posed, head: int, points_m: np.ndarray) -> np.ndarray:
+        """Vertices [P, K] that the field reads at points [P, 3] of one posed head, nearest first."""
+        points_m = np.where(np.isfinite(points_m), points_m, 0)  # a tree refuses others; the field makes them a bad loss
         wanted = self.field.neighbours
         searched = wanted if self.mates is None else min(CANDIDATES * wanted, posed.vertices_m.shape[1])
         if posed.vertices_m.device.type == "cpu":
-            found = nearest_by_tree(posed.trees[head], points, searched, torch.get_num_threads())
+            found = nearest_by_tree(posed.trees[head], points_m, searched, torch.get_num_threads())
         else:
-            there = torch.from_numpy(points).to(posed.vertices_m.device)
+            there = torch.from_numpy(points_m).to(posed.vertices_m.device)
             found = nearest_by_blocks(posed.vertices_m[head], there, searched).cpu().numpy()
         return found if self.mates is None else keep_mates(found, self.mates, wanted)
-
-    @torch.no_grad()
-    def march(self, posed: Posed, rays: Rays, precision: torch.dtype) -> tuple[Rendered, int]:
-        """Render the first posed head front to back in blocks of samples, without gradients.
-
-        A ray ends when less than END of the light behind it would still pass; memory does not grow with the image.
-        Returns N rays and the number of field evaluations.
-        """
-        if self.hierarchical:
-            return self._march_dense(posed, rays, precision)
-        terms = self.field.vertex_terms(self.source(posed.condition).values, precision).flatten(0, 1)
-        vertices, device = posed.vertices_m[0], terms.device
-        count_rays = len(rays.origins_m)
-        colour, opacity, depth = torch.ones(count_rays, 3), torch.zeros(count_rays), torch.zeros(count_rays)
-        grid, evaluations = self._pruned(posed, terms, precision)
-        for start in range(0, count_rays, RAY_CHUNK):
-            chunk = Rays(rays.origins_m[start : start + RAY_CHUNK], rays.directions[start : start + RAY_CHUNK])
-            found, count, met = shell.intervals(grid, chunk.origins_m, chunk.directions)
-            samples = shell.sample(found, count, self.step_m, self.max_samples, None, met)
-            light, shade, middle = (
-                np.ones(len(count), np.float32),
-                np.zeros((len(count), 3), np.float32),
-                np.zeros(len(count), np.float32),
-            )
-            for block in range(0, self.max_samples, SLOT_BLOCK):
-                chosen = np.nonzero((samples.slot >= block) & (samples.slot < block + SLOT_BLOCK) & (light[samples.ray] > END))[0]
-                if not len(chosen):
-                    break
-                ray, distance = samples.ray[chosen], samples.distance_m[chosen]
-                directions = chunk.directions[ray]
-                points = chunk.origins_m[ray] + distance[:, None] * directions
-                index = torch.from_numpy(self._nearest(posed, 0, points)).to(device)
-                density, tint = self._evaluate(
-                    torch.from_numpy(points).to(device),
-                    torch.from_numpy(directions).to(device),
-                    vertices,
-                    index,
-                    terms,
-                    precision,
-                )
-                present, place = np.unique(ray, return_inverse=True)
-                part, weight = composite(
-                    density * torch.from_numpy(samples.step_m[chosen]).to(device)
-                    + CLOSED * torch.from_numpy(samples.closed[chosen]).to(device),
-                    tint,
-                    torch.from_numpy(distance).to(device),
-                    torch.from_numpy(place).to(device),
-                    torch.from_numpy(samples.slot[chosen] - block).to(device),
-                    len(present),
-                    0.0,
-                )
-                shade[present] += light[present, None] * part.colour.cpu().numpy()
-                middle[present] += light[present] * (part.depth * part.opacity).cpu().numpy()
-                light[present] *= 1 - part.opacity.cpu().numpy()
-                evaluations += len(chosen)
-            here = slice(start, start + len(count))
-            opacity[here] = torch.from_numpy(1 - light)
-            colour[here] = torch.from_numpy(shade + light[:, None])
-            depth[here] = torch.from_numpy(middle / np.where(light < 1, 1 - light, 1))
-        return Rendered(colour, opacity, depth), evaluations
-
-    def _march_dense(self, posed: Posed, rays: Rays, precision: torch.dtype) -> tuple[Rendered, int]:
-        """The same for hierarchical samples: every ray in full, some at a time."""
-        features, parts, evaluations = self.source(posed.condition), [], 0
-        for start in range(0, max(len(rays.origins_m), 1), DENSE_CHUNK):
-            some = Rays(*(array[start : start + DENSE_CHUNK] for array in rays))
-            outcome = self.render(posed, [some], precision, features=features)
-            parts.append(outcome.renders[-1])
-            evaluations += outcome.evaluations
-        return Rendered(*(torch.cat(column).cpu() for column in zip(*parts, strict=True))), evaluations
-
-    def _pruned(self, posed: Posed, terms: Tensor, precision: torch.dtype) -> tuple[shell.Grid, int]:
-        """The first head's shell without the voxels whose surroundings the field leaves empty: one evaluation a voxel.
-
-        A voxel stays when any of its 27 neighbours, itself included, has an optical depth of VOID at its centre.
-        """
-        grid, device = posed.grids[0], terms.device
-        place = np.argwhere(grid.labels == shell.SHELL)
-        points = ((place + 0.5) * shell.VOXEL_M + grid.origin).astype(np.float32)
-        index = torch.from_numpy(self._nearest(posed, 0, points)).to(device)
-        points = torch.from_numpy(points).to(device)
-        density = self._evaluate(points, torch.zeros_like(points), posed.vertices_m[0], index, terms, precision)[0]
-        full = np.zeros(grid.labels.shape, bool)
-        full[tuple(place.T)] = (density * shell.VOXEL_M > VOID).cpu().numpy()
-        keep = ndimage.binary_dilation(full, np.ones((3, 3, 3), bool)) | (grid.labels == shell.CORE)
-        return shell.Grid(grid.origin, np.where(keep, grid.labels, shell.EMPTY)), len(place)
-
-    def _evaluate(
-        self, points: Tensor, directions: Tensor, vertices: Tensor, index: Tensor, terms: Tensor, precision: torch.dtype
-    ) -> tuple[Tensor, Tensor]:
-        """The field in pieces that stay in the processor's cache."""
-        pieces = zip(points.split(FIELD_CHUNK), directions.split(FIELD_CHUNK), index.split(FIELD_CHUNK), strict=True)
-        results = [self.field(p, d, vertices, i, terms, precision) for p, d, i in pieces]
-        return torch.cat([r[0] for r in results]), torch.cat([r[1] for r in results])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from avatar import shell
@@ -91,6 +92,63 @@ def by_weight(
     distance = np.sort(np.concatenate([coarse_m, near_m[:, None] + (stratum + inside) * width], 1), 1)
     edges = np.concatenate([near_m[:, None], (distance[:, 1:] + distance[:, :-1]) / 2, far_m[:, None]], 1)
     return _flat(distance, np.diff(edges, axis=1))
+
+
+def refine(
+    found: np.ndarray, count: np.ndarray, coarse: shell.Samples, weights: np.ndarray, met: np.ndarray
+) -> tuple[shell.Samples, np.ndarray]:
+    """The samples in the middles of a shell's strata, and as many more on each ray where these saw something.
+
+    found, count, met: from `shell.intervals`; coarse: P samples without jitter; weights: [P] of their rendering.
+    The new ones invert the coarse weights' distribution, constant inside a stratum, at evenly spaced levels. A sample stands
+    for the stretch of shell halfway to its neighbours; the last one of a ray that ends at the core is closed.
+    Returns 2 P samples, and for each its place among the coarse ones, or -1 for a new one.
+    """
+    size = 2 * len(coarse.ray)
+    distance, step = np.empty(size, np.float32), np.empty(size, np.float32)
+    ray, slot, old = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
+    arrays = np.asarray(coarse.step_m, np.float64), coarse.ray, np.asarray(weights, np.float64)
+    _refine(found, count, *arrays, distance, step, ray, slot, old)
+    last = np.append(ray[1:] != ray[:-1], True) if size else np.zeros(0, bool)
+    return shell.Samples(distance, step, ray, slot, last & met[ray]), old
+
+
+@numba.njit(cache=True)
+def _refine(found, count, stratum, rays, weights, distance, step, ray, slot, old):  # noqa: ANN001, ANN202
+    first, at = 0, 0
+    while first < len(rays):
+        n, last = rays[first], first
+        while last < len(rays) and rays[last] == n:
+            last += 1
+        number, width = last - first, stratum[first]
+        total = 0.0
+        for i in range(first, last):
+            total += weights[i] + FLOOR
+        along = np.empty(2 * number)  # in the shell, from its start
+        passed, bin_, drawn, taken = 0.0, 0, 0, 0
+        for rank in range(2 * number):
+            fine = np.inf
+            if drawn < number:
+                wanted = (drawn + 0.5) / number * total
+                while bin_ < number - 1 and passed + weights[first + bin_] + FLOOR < wanted:
+                    passed += weights[first + bin_] + FLOOR
+                    bin_ += 1
+                fine = (bin_ + min(max((wanted - passed) / (weights[first + bin_] + FLOOR), 0.0), 1.0)) * width
+            middle = (taken + 0.5) * width if taken < number else np.inf
+            if middle <= fine:
+                along[rank], old[at + rank], taken = middle, first + taken, taken + 1
+            else:
+                along[rank], old[at + rank], drawn = fine, -1, drawn + 1
+        interval, before = 0, 0.0
+        for rank in range(2 * number):
+            low = (along[rank] + along[rank - 1]) / 2 if rank else 0.0
+            high = (along[rank] + along[rank + 1]) / 2 if rank < 2 * number - 1 else number * width
+            while interval < count[n] - 1 and along[rank] > before + found[n, interval, 1] - found[n, interval, 0]:
+                before += found[n, interval, 1] - found[n, interval, 0]
+                interval += 1
+            distance[at + rank] = min(found[n, interval, 0] + along[rank] - before, found[n, interval, 1])
+            step[at + rank], ray[at + rank], slot[at + rank] = high - low, n, rank
+        at, first = at + 2 * number, last
 
 
 def median_samples(weights: np.ndarray, ray: np.ndarray) -> np.ndarray:

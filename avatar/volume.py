@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+CLOSED = 20.0  # optical depth where a ray ends at the core: the head is opaque, white never shines through it
+
 
 class Rays(NamedTuple):
     """N rays of one posed head, in its neck-normalised frame; geometry, so numpy and without gradients."""

@@ -11,7 +11,7 @@ import torch
 from test_hard_rays import cast, twin
 from torch import Tensor
 from toy_head import toy_head, toy_track
-from toy_run import SMALL
+from toy_run import SMALL, marched_in_one_pass
 
 from avatar import build, shell
 from avatar.config import TrainConfig
@@ -19,8 +19,8 @@ from avatar.coverage import base_thickness
 from avatar.dataset import Scene
 from avatar.features import Condition
 from avatar.features.ours_d import DisplacementFeatures
-from avatar.radiance import CLOSED, RadianceAvatar
-from avatar.volume import Rays
+from avatar.radiance import RadianceAvatar
+from avatar.volume import CLOSED, Rays
 from fitting.head_model import HeadModel
 from fitting.raster import vertex_normals
 
@@ -99,8 +99,7 @@ def test_marching_equals_rendering_on_wild_codes(head: HeadModel, factor: float)
     avatar, scene = new_avatar(head), wild_scene(head, factor)
     rows, columns = np.mgrid[:40:2, :40:2]
     rays, posed = scene.rays(0, columns.ravel(), rows.ravel()), avatar.pose(*scene.heads([0], "cpu"))
-    with torch.no_grad():
-        whole = avatar.render(posed, [rays], torch.float32).renders[-1]
+    whole = marched_in_one_pass(avatar, posed, rays)
     blocks, _ = avatar.march(posed, rays, torch.float32)
     assert all(torch.isfinite(value).all() for value in blocks)
     assert (blocks.colour - whole.colour).abs().max() < 0.006 and (blocks.opacity - whole.opacity).abs().max() < 0.006

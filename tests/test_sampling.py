@@ -10,7 +10,7 @@ import torch
 from toy_head import toy_head, toy_track
 from toy_run import SMALL, train_in, write_subject
 
-from avatar import build, sampling
+from avatar import build, sampling, shell
 from avatar.config import TrainConfig
 from avatar.dataset import Scene
 from avatar.volume import Rays
@@ -71,6 +71,39 @@ def test_points_of_several_heads_are_one_batch() -> None:
     packed = sampling.join(parts)
     assert packed.ray.tolist() == [0] * 3 + [1] * 3 + [2] * 3 + [3] * 3 and packed.head.tolist() == [0] * 6 + [1] * 6
     np.testing.assert_allclose(packed.points_m[4], [0, packed.distance_m[4], 0])
+
+
+@pytest.mark.parametrize("kind", ["random", "one", "none"])
+def test_refine_equals_a_loop_that_inverts_the_weights(kind: str) -> None:
+    random = np.random.default_rng(3)
+    found, count = np.zeros((6, shell.MAX_INTERVALS, 2)), np.array([1, 3, 0, 2, 1, 4])
+    for n, number in enumerate(count):
+        found[n, :number] = 0.4 + np.cumsum(random.uniform(0.001, 0.02, 2 * number)).reshape(number, 2)
+    met = random.random(6) < 0.5
+    coarse = shell.sample(found, count, 0.004, 7, None, met)
+    weights = {"random": random.random(len(coarse.ray)), "one": (coarse.slot == 1) * 1.0, "none": 0.0 * coarse.slot}[kind]
+    samples, old = sampling.refine(found, count, coarse, weights, met)
+    assert len(samples.ray) == 2 * len(coarse.ray) and sorted(old[old >= 0]) == list(range(len(coarse.ray)))
+    for n in np.flatnonzero(count):
+        own, before = samples.ray == n, coarse.ray == n
+        lengths = np.diff(found[n, : count[n]], axis=1)[:, 0]
+        total, number = lengths.sum(), before.sum()
+        probability = (weights[before] + sampling.FLOOR) / (weights[before] + sampling.FLOOR).sum()
+        levels = np.concatenate([[0], np.cumsum(probability)])
+        drawn = np.interp((np.arange(number) + 0.5) / number, levels, np.linspace(0, total, number + 1))
+        along = np.sort(np.concatenate([(np.arange(number) + 0.5) * total / number, drawn]))
+        interval = np.searchsorted(np.cumsum(lengths), along - 1e-9).clip(0, count[n] - 1)
+        expected = found[n, interval, 0] + along - np.concatenate([[0], np.cumsum(lengths)])[interval]
+        np.testing.assert_allclose(samples.distance_m[own], expected, atol=1e-6)
+        edges = np.concatenate([[0], (along[1:] + along[:-1]) / 2, [total]])
+        np.testing.assert_allclose(samples.step_m[own], np.diff(edges), atol=1e-6)
+        assert samples.slot[own].tolist() == list(range(2 * number))
+        assert samples.closed[own].tolist() == [False] * (2 * number - 1) + [bool(met[n])]
+        np.testing.assert_allclose(samples.distance_m[own][old[own] >= 0], coarse.distance_m[before], atol=1e-6)
+    empty, none = sampling.refine(
+        found[2:3], count[2:3], shell.sample(found[2:3], count[2:3], 0.1, 3, None), weights[:0], met[2:3]
+    )
+    assert len(empty.ray) == len(none) == 0
 
 
 def test_median_samples_equal_a_loop() -> None:

@@ -8,10 +8,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import torch
 from toy_head import toy_head, toy_images, toy_track
 
-from avatar import train
+from avatar import marching, sampling, shell, train
 from avatar.config import TrainConfig
+from avatar.radiance import Posed, RadianceAvatar
+from avatar.volume import Rays, Rendered
 from workflow.step import Job
 
 SMALL = {
@@ -63,3 +66,19 @@ def train_in(folder: Path, inputs: dict[str, Path], code: str = "c", **keys: obj
     outputs = {"avatar": folder / "avatar.pt", "curve": folder / "curve.tsv", "report": folder / "train.json"}
     train.run(job(TrainConfig(**(SMALL | keys)), inputs, outputs, code))
     return outputs
+
+
+def marched_in_one_pass(avatar: RadianceAvatar, posed: Posed, rays: Rays) -> Rendered:
+    """What `march` draws in the shell, with every sample of every ray evaluated: no blocks, no early end, no pruning."""
+
+    def seen(samples: shell.Samples) -> tuple[Rendered, torch.Tensor]:
+        packed = sampling.pack(rays, samples)
+        index = torch.from_numpy(avatar.nearest(posed, 0, packed.points_m))
+        terms = avatar.field.vertex_terms(avatar.source(posed.condition).values, torch.float32)[0]
+        points, along = torch.from_numpy(packed.points_m), torch.from_numpy(packed.directions)
+        return marching.composited(samples, *avatar.field(points, along, posed.vertices_m[0], index, terms), len(count))
+
+    with torch.no_grad():
+        found, count, met = shell.intervals(posed.grids[0], rays.origins_m, rays.directions)
+        coarse = shell.sample(found, count, 2 * avatar.step_m, avatar.max_samples // 2, None, met)
+        return seen(sampling.refine(found, count, coarse, seen(coarse)[1].numpy(), met)[0])[0]
