@@ -23,7 +23,7 @@ from avatar.build import build, settings_of
 from avatar.config import RenderConfig, Settings, TrainConfig, VariantConfig
 from avatar.features import Condition
 from avatar.features.shared import code_count
-from avatar.field import Field
+from avatar.field import ROWS, Field
 from fitting.head_model import HeadModel
 from workflow.settings import SettingsError, resolve_variants, validated
 
@@ -120,9 +120,10 @@ def field_rows(field: Field) -> list[Row]:
     Here the part of it that reads the feature runs once a vertex and frame, which is the same sum (`Field.vertex_terms`).
     """
     weight, width = field.from_feature.weight, field.from_feature.out_features
-    points, vertices = weight.new_zeros(1, 3), weight.new_zeros(field.neighbours, 3)
-    index = torch.arange(field.neighbours, device=weight.device)[None]
-    flop = counted(field, points, points, vertices, index, weight.new_zeros(field.neighbours, width), weight.dtype)
+    points, vertices = weight.new_zeros(ROWS, 3), weight.new_zeros(field.neighbours, 3)  # the field pads fewer
+    index = torch.arange(field.neighbours, device=weight.device).expand(ROWS, -1)
+    total = counted(field, points, points, vertices, index, weight.new_zeros(field.neighbours, width), weight.dtype)
+    flop = {name: value // ROWS for name, value in total.items()}
     flop["from_feature.weight"] = 2 * field.neighbours * weight.numel()
     rows = [row._replace(block=FIELD_BLOCKS[row.name.split(".")[0]]) for row in rows_of(field, "", flop, flop, "sample")]
     mixed = Row(WEIGHTED_SUM, "", f"{field.neighbours} x {width} -> {width}", 0, flop[WEIGHTED_SUM], flop[WEIGHTED_SUM], "sample")

@@ -27,6 +27,12 @@ def inverse_distance_weights(offsets_m: Tensor) -> Tensor:
     return ratio / ratio.sum(-1, keepdim=True)
 
 
+def padded(rows: Tensor) -> Tensor:
+    """rows: [P, C] with the last one repeated until their number is a multiple of ROWS (a real one, so that it is finite)."""
+    spare = -len(rows) % ROWS
+    return torch.cat([rows, rows[-1:].expand(spare, -1)]) if spare and len(rows) else rows
+
+
 class Field(nn.Module):
     """Density and colour at points, from their K nearest vertices and these vertices' features."""
 
@@ -70,9 +76,7 @@ class Field(nn.Module):
         Returns density [P] per metre, >= 0, and colour [P, 3] in [0, 1].
         """
         count = len(points_m)
-        spare = -count % ROWS
-        points_m, directions = functional.pad(points_m, (0, 0, 0, spare)), functional.pad(directions, (0, 0, 0, spare))
-        index = functional.pad(index, (0, 0, 0, spare))
+        points_m, directions, index = (padded(rows) for rows in (points_m, directions, index))
         offsets = vertices_m[index] - points_m[:, None]  # [P, K, 3]
         weights = inverse_distance_weights(offsets)
         encoded = positional_encoding(offsets / HEAD_SIZE_M, self.bands)
