@@ -17,7 +17,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import torch
 
 from avatar import evaluate, lpips, pictures, render, train
 from avatar.config import AblationConfig, RenderConfig
@@ -75,7 +74,8 @@ def scored(job: step.Job, work: Path) -> tuple[dict[str, dict[str, float]], list
     for name, (track, truth, matte) in sets.items():
         drawn = rendered(job, work, track, truth.shape[1:3])
         inside = [opaque > INSIDE for opaque in matte]
-        rows = evaluate.score(images(truth), images(drawn), images(matte[..., None])[:, 0], inside, network)
+        filmed, made, mask = (evaluate.images(part, job.device) for part in (truth, drawn, matte[..., None]))
+        rows = evaluate.score(filmed, made, mask[:, 0], inside, network)
         scores[name] = {metric: round(float(np.mean([row[metric] for row in rows])), 6) for metric in METRICS}
         scores[name] |= {"psnr_inside": round(float(np.mean([row["psnr_face"] for row in rows])), 6), "frames": len(rows)}
         places = np.linspace(0, len(rows) - 1, min(SHOWN, len(rows))).round().astype(int)
@@ -103,11 +103,6 @@ def rendered(job: step.Job, work: Path, track: Path, size: tuple[int, int]) -> n
         render.render_frame(avatar, scene, frame, size, precision, job.device)[0] for frame in job.progress(frames, "rendering")
     ]
     return np.stack(drawn)
-
-
-def images(array: np.ndarray) -> torch.Tensor:
-    """uint8 [B, H, W, C] -> float [B, C, H, W] in [0, 1]."""
-    return torch.from_numpy(np.ascontiguousarray(array)).float().div(255).permute(0, 3, 1, 2)
 
 
 if __name__ == "__main__":

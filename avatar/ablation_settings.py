@@ -30,7 +30,7 @@ class Cell:
     what: str
     """One phrase for the table."""
     group: str = "full"
-    """`full`, `table`, `half` (the first half of the training frames), `warp` or `true`."""
+    """`full`, `table`, `half` (the first half of the training frames), `warp`, `true`, or `overfit` (four frames, the truth)."""
 
     @property
     def simulated_only(self) -> bool:

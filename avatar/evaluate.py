@@ -70,6 +70,11 @@ def face_crop(image: Tensor, hull: np.ndarray) -> Tensor:
     return torch.nn.functional.pad(crop, (0, short[0], 0, short[1]), value=1.0)[None]
 
 
+def images(array: np.ndarray, device: str) -> Tensor:
+    """uint8 [B, H, W, C] -> float [B, C, H, W] in [0, 1] on the device."""
+    return torch.from_numpy(array).to(device).float().div(255).permute(0, 3, 1, 2)
+
+
 def score(
     truth: Tensor, render: Tensor, alpha: Tensor, hulls: list[np.ndarray | None], network: lpips.Lpips
 ) -> list[dict[str, float]]:
@@ -147,17 +152,13 @@ def run(job: step.Job) -> None:
     size = frames.shape[1:3]
     rows: list[dict[str, Any]] = []
 
-    def images(array: np.ndarray) -> Tensor:
-        """uint8 [B, H, W, C] -> float [B, C, H, W] in [0, 1] on the device."""
-        return torch.from_numpy(array).to(job.device).float().div(255).permute(0, 3, 1, 2)
-
     for start in job.progress(range(0, len(scored), BATCH_FRAMES), "batches of test frames"):
         batch = scored[start : start + BATCH_FRAMES]
         places, chosen = [place for place, _ in batch], [frame for _, frame in batch]
-        mask = images(alpha[chosen][..., None])[:, 0]
+        mask = images(alpha[chosen][..., None], job.device)[:, 0]
         hulls = [face_hull(points[frame], size) if found[frame] else None for frame in chosen]
         hulls = [hull if hull is not None and hull.any() else None for hull in hulls]
-        scores = score(images(frames[chosen]), images(render[places]), mask, hulls, network)
+        scores = score(images(frames[chosen], job.device), images(render[places], job.device), mask, hulls, network)
         for frame, row, hull in zip(chosen, scores, hulls, strict=True):
             rows.append({"frame": frame} | row | {"note": "" if hull is not None else "no face landmarks: face scores left out"})
     _check(rows, job.input.render)
