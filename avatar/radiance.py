@@ -83,8 +83,9 @@ class RadianceAvatar(nn.Module):
 
     def sharpen(self, factor: float) -> None:
         """Take `factor` times as many samples on a ray from now on."""
-        self.step_m, self.max_samples = self.step_m / factor, round(self.max_samples * factor)
-        self.coarse_samples, self.fine_samples = round(self.coarse_samples * factor), round(self.fine_samples * factor)
+        counts = (self.max_samples, self.coarse_samples, self.fine_samples)
+        self.max_samples, self.coarse_samples, self.fine_samples = (max(1, round(count * factor)) for count in counts)
+        self.step_m /= factor
 
     @property
     def jitter_width(self) -> int:
