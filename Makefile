@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 DEMO := build/demo/videos
-ASSETS := face_landmarker.task selfie_segmentation.tflite lpips_alexnet.ckpt carphone.mp4
+ASSETS := face_landmarker.task selfie_segmentation.tflite lpips_alexnet.ckpt lpips_vgg16.ckpt carphone.mp4
 
 .PHONY: demo test lint clean
 .DELETE_ON_ERROR:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 
+from avatar import provenance
 from avatar.config import BaselineConfig
 from avatar.frames import chosen_frames
 from fitting.camera import project
@@ -25,6 +26,7 @@ from workflow import step
 CHUNK_FRAMES = 16
 VERTICES = 500
 """About this many vertices of the head model are compared."""
+COUNTED = "all frames at once, divided by their number: a predictor renders nothing"
 DISTANCE = "rms distance in pixels between the projected vertices of the two fitted heads"
 
 
@@ -102,7 +104,8 @@ def _predict(job: step.Job, frames: np.ndarray, alpha: np.ndarray, train: list[i
         chosen, distances = nearest_frames(_pixels(load_head(job.input.head), track), train, test)
         render = np.stack([on_white(frames[index], alpha[index]) for index in chosen])
         facts = {"training_frames": len(train), "how": DISTANCE, "nearest": chosen, "distance_px": distances.round(3).tolist()}
-    return render, facts | {"ms_per_frame": 1e3 * (time.perf_counter() - started) / len(test)}
+    mean = 1e3 * (time.perf_counter() - started) / len(test)
+    return render, facts | {"ms_per_frame": mean, "ms": [round(mean, 3)] * len(test), "ms_counts": COUNTED}
 
 
 def run(job: step.Job) -> None:
@@ -122,7 +125,7 @@ def run(job: step.Job) -> None:
     inputs = (on_white(frames[frame], alpha[frame]) for frame in test)
     pairs = (np.concatenate(pair, 1)[..., :3] for pair in zip(inputs, render, strict=True))
     shown = float(index["fps"]) * len(test) / len(split["test"])  # frames left out must not speed it up
-    write_video(job.output.video, pairs, max(1.0, shown))
+    write_video(job.output.video, pairs, max(1.0, shown), provenance.FILMED)
     job.write_json(job.output.report, {"predictor": True, "name": job.config.predictor, "frames": test} | facts)
     job.log.info("%s: %d test frames from %d training frames", job.config.predictor, len(test), len(train))
 

@@ -20,10 +20,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
 from avatar.build import build, settings_of
-from avatar.config import RenderConfig, Settings, TrainConfig, VariantConfig
+from avatar.config import RenderConfig, TrainConfig
 from avatar.features import Condition
 from avatar.features.shared import code_count
 from avatar.field import ROWS, Field
+from avatar.settings import Settings, VariantConfig
 from fitting.head_model import HeadModel
 from workflow.settings import SettingsError, resolve_variants, validated
 

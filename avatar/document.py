@@ -17,7 +17,8 @@ from typing import Any, Literal
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from avatar.config import RenderConfig, Settings, TrainConfig
+from avatar.config import RenderConfig, TrainConfig
+from avatar.settings import Settings
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "config" / "README.md"

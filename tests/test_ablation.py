@@ -15,8 +15,13 @@ import torch
 from pipeline import Pipeline
 from toy_run import SMALL, job, write_subject
 
-from avatar import ablation, ablation_data, ablation_settings, ablation_truth, train
-from avatar.config import AblationConfig, AblationDataConfig, TrainConfig
+from avatar import train
+from avatar.ablation import cell as ablation
+from avatar.ablation import data as ablation_data
+from avatar.ablation import settings as ablation_settings
+from avatar.ablation import truth as ablation_truth
+from avatar.ablation.config import AblationConfig, AblationDataConfig
+from avatar.config import TrainConfig
 from avatar.dataset import Scene
 from fitting import simulate, synthetic
 from fitting.config import SimulateConfig
@@ -252,9 +257,9 @@ def test_runs_when_asked_for_and_is_then_done(pipeline: Pipeline) -> None:
     result = pipeline.run("ablation")
     assert result.code == 0, result.text
     ran = pipeline.ran()
-    rows = [line for line in ran if line.startswith("avatar.ablation ")]
-    assert len(rows) == len(ablation_settings.planned(["bob"])) and "avatar.ablation bob" in rows
-    assert ran.count("avatar.ablation_truth simulated") == 1 and not [line for line in ran if line.startswith("avatar.train")]
+    rows = [line for line in ran if line.startswith("avatar.ablation.cell ")]
+    assert len(rows) == len(ablation_settings.planned(["bob"])) and "avatar.ablation.cell bob" in rows
+    assert ran.count("avatar.ablation.truth simulated") == 1 and not [line for line in ran if line.startswith("avatar.train")]
     assert pipeline.plan("ablation") == set()
 
     def made(path: str) -> list[str]:
@@ -276,7 +281,7 @@ def test_runs_when_asked_for_and_is_then_done(pipeline: Pipeline) -> None:
         (pipeline.folder / "results/ablation" / name).unlink()
     pipeline.forget()
     assert pipeline.run("ablation").code == 0
-    assert pipeline.ran() == [f"avatar.ablation {SUBJECT}", "avatar.ablation_table ablation"]
+    assert pipeline.ran() == [f"avatar.ablation.cell {SUBJECT}", "avatar.ablation.table ablation"]
 
 
 def test_a_source_is_trained_again_alone_when_its_code_changes(pipeline: Pipeline) -> None:
@@ -284,8 +289,8 @@ def test_a_source_is_trained_again_alone_when_its_code_changes(pipeline: Pipelin
     pipeline.forget()
     assert pipeline.run("ablation").code == 0
     # On a constant, all or half of the data, with every seed; without it with the first.
-    cells = [*(2 * 3 + 2) * [f"avatar.ablation {SUBJECT}"], *2 * ["avatar.ablation bob"]]
-    assert sorted(pipeline.ran()) == sorted([*cells, "avatar.ablation_table ablation"])
+    cells = [*(2 * 3 + 2) * [f"avatar.ablation.cell {SUBJECT}"], *2 * ["avatar.ablation.cell bob"]]
+    assert sorted(pipeline.ran()) == sorted([*cells, "avatar.ablation.table ablation"])
 
 
 def test_its_folder_is_no_subject(tmp_path: Path) -> None:

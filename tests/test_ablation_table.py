@@ -9,13 +9,17 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from test_latex import check
 
-from avatar import ablation_report, ablation_settings, ablation_table
-from avatar.ablation_report import Results
-from avatar.config import AblationTableConfig
+from avatar.ablation import report as ablation_report
+from avatar.ablation import settings as ablation_settings
+from avatar.ablation import table as ablation_table
+from avatar.ablation.config import AblationTableConfig
+from avatar.ablation.report import Results
 from workflow import step
 
 SUBJECT = ablation_settings.SUBJECT
+ENDS = {"csv": "csv", "markdown": "md", "latex": "tex", "plot": "svg"}
 SVG = "{http://www.w3.org/2000/svg}"
 LPIPS = {"static": 0.16, "codes": 0.17, "codes_mlp": 0.155, "ours_c": 0.14, "ours_d": 0.145, "displacement_mlp": 0.15}
 
@@ -57,7 +61,7 @@ def collect(folder: Path, rows: dict[tuple[str, str, int], dict]) -> SimpleNames
         paths.append(folder / "rows" / subject / cell / f"{seed}.json")
         paths[-1].parent.mkdir(parents=True, exist_ok=True)
         paths[-1].write_text(json.dumps(content))
-    output = SimpleNamespace(csv=folder / "t.csv", markdown=folder / "t.md", plot=folder / "t.svg")
+    output = SimpleNamespace(**{name: folder / f"t.{end}" for name, end in ENDS.items()})
     log = SimpleNamespace(info=lambda *_: None)
     ablation_table.run(step.Job(AblationTableConfig(), SimpleNamespace(rows=paths), output, output, "all", 1, "cpu", "", log))
     return output
@@ -92,14 +96,33 @@ def test_markdown_has_the_papers_layout(tmp_path: Path) -> None:
     text = collect(tmp_path, made()).markdown.read_text()
     title = "| subject | Static features | 3DMM Codes | 3DMM Codes MLP | Ours-C | Ours-D | Displacement MLP |"
     assert text.count(title) == 8  # three metrics and doubled codes, twice
-    line = "| talk_0_360_bald (simulated) | 0.1610 ± 0.0010 | 0.1710 ± 0.0010 | 0.1560 ± 0.0010 | **0.1410 ± 0.0010** |"
-    assert line in text and "| ann | 0.1400 | **0.1300** |" in text
-    assert "| ann | - | - | - | - |" in text.split("first half")[1]
+    line = "| talk_0_360_bald (simulated) | 0.1610 ± 0.0010 | 0.1710 ± 0.0010 | 0.1560 ± 0.0010 | **0.1410 ± 0.0010** | "
+    assert line + "<ins>0.1460 ± 0.0010</ins> |" in text and "| ann | <ins>0.1400</ins> | **0.1300** |" in text
+    assert "| ann | not run | not run | not run | not run |" in text.split("first half")[1]
     constant = text.split("## On a learned constant")[1]
-    assert "| 0.1610 ± 0.0010 | 0.1710 ± 0.0010 | - | - | **0.1200 ± 0.0000** | - |" in constant
+    none = "not run | not run"
+    assert f"| <ins>0.1610 ± 0.0010</ins> | 0.1710 ± 0.0010 | {none} | **0.1200 ± 0.0000** | not run |" in constant
     assert "not measured." in constant and "| 0.1300 ± 0.0000 | 0.0100 ± 0.0000 |" in constant
     assert "true head and parameters | 0.0900 ± 0.0000 |" in text and "2000 steps of 256 rays" in text
     assert "180 s each in the median" in text and "nan" not in text.lower()
+
+
+def test_latex_has_the_papers_layout(tmp_path: Path) -> None:
+    rows = made() | {("Zoë_2", name, 0): row(lpips) for name, lpips in LPIPS.items()}
+    rows |= {("Zoë_2", "ours_c_half", 0): row(0.1300), ("Zoë_2", "ours_d_half", 0): row(0.1450)}
+    source = collect(tmp_path, rows).latex.read_text()
+    check(source)
+    assert source.count(r"\begin{table") == 2 and source.count(r"\multicolumn") == 6
+    lines = source.split(r"\begin{table")[1].splitlines()
+    assert r" & \textit{talk\_0\_360\_bald (simulated)} & \textit{Zoë\_2} & \textit{ann} \\" in lines
+    spread = r" {\scriptsize $\pm$ 0.0010}"
+    assert rf"Ours-C & \textbf{{0.1410}}{spread} & \textbf{{0.1400}} & 0.1600 \\" in lines
+    assert rf"Ours-D & \underline{{0.1460}}{spread} & \underline{{0.1450}} & 0.1550 \\" in lines
+    place = lines.index(rf"Ours-C & 0.2010{spread} & 0.1300 & not run \\")
+    assert lines[place - 2].startswith(r"\multicolumn{4}{c}{\footnotesize \textit{First $50\%$ Training Data}}")
+    worse, better = r"\textcolor{red}{+0.0600}", r"\textcolor[rgb]{0,0.5,0}{-0.0100}"
+    assert lines[place + 1] == rf" & {worse} & {better} & no comparison \\"
+    assert r"unknown\textsuperscript" in source and "no true pictures of doubled codes" in source
 
 
 def test_failed_and_missing_cells_are_said(tmp_path: Path) -> None:
@@ -107,8 +130,15 @@ def test_failed_and_missing_cells_are_said(tmp_path: Path) -> None:
     text = collect(tmp_path, rows).markdown.read_text()
     assert f"- {SUBJECT}, codes, seed 1: training diverges at step 3" in text
     assert "0.1710 ± 0.0010" in text  # the other two seeds
+    rows |= {("ann", "codes", 0): {"load": 1.0, "failed": "out of 100% luck"}}
+    found = collect(tmp_path / "two", rows)
+    assert "| ann | **0.1400** | failed, see below |" in found.markdown.read_text()
+    source = found.latex.read_text()
+    assert r"& failed\textsuperscript{1} \\" in source
+    assert r"\textsuperscript{1}\,out of 100\% luck" in source
+    check(source)
     alone = collect(tmp_path / "one", {("ann", "static", 0): {"load": 1.0, "failed": "dark"}})
-    assert "Not measured." in alone.markdown.read_text()
+    assert "Not measured." in alone.markdown.read_text() and r"\begin" not in alone.latex.read_text()
     ElementTree.parse(alone.plot)
 
 
@@ -121,6 +151,11 @@ def test_csv_and_plot(tmp_path: Path) -> None:
     marks = {item.get("id") for item in ElementTree.parse(output.plot).getroot().iter(f"{SVG}g")}
     assert {f"{SUBJECT}-ours_d-doubled", f"{SUBJECT}-ours_d_table_true-test", "ann-static-test"} <= marks
     assert "ann-static-doubled" not in marks
+
+
+def test_a_score_that_is_not_a_number_is_named(tmp_path: Path) -> None:
+    with pytest.raises(step.StepError, match=r"0\.json: lpips of the test frames is nan"):
+        collect(tmp_path, {("ann", "codes", 0): row(float("nan"))})
 
 
 def test_a_damaged_row_is_named(tmp_path: Path) -> None:

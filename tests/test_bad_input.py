@@ -12,7 +12,8 @@ import pytest
 import yaml
 from pipeline import REPOSITORY, Pipeline, Result
 
-from avatar.config import RenderConfig, Settings, TrainConfig
+from avatar.config import RenderConfig, TrainConfig
+from avatar.settings import Settings
 from workflow import settings
 
 

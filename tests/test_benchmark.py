@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from pipeline import Pipeline
 
-from avatar import compare
-from avatar.config import CompareConfig, Settings
+from avatar.report import compare
+from avatar.report.config import CompareConfig
+from avatar.settings import Settings
 from fitting import benchmark, benchmark_settings, benchmark_table
 from fitting.config import BenchmarkConfig, SimulateConfig
 from fitting.tracking import Clip
@@ -104,7 +105,7 @@ def test_plot_is_svg_with_a_mark_a_setting(tmp_path: Path) -> None:
 
 
 def test_every_setting_has_a_look_of_its_own() -> None:
-    from avatar import tracking_figure
+    from avatar.report import tracking_figure
 
     rows = [row(subject, 40.0, 1.0) | {"setting": name} for subject, name in benchmark_settings.planned([])]
     found = tracking_figure.looks_of(benchmark_table.sections(rows))
@@ -214,7 +215,7 @@ def test_runs_and_is_then_done(pipeline: Pipeline) -> None:
         (pipeline.folder / "results/tracking_benchmark" / name).unlink()
     pipeline.forget()
     assert pipeline.run("tracking_benchmark").code == 0
-    assert pipeline.ran() == [f"fitting.benchmark {SLOW}", "avatar.compare tracking_benchmark"]
+    assert pipeline.ran() == [f"fitting.benchmark {SLOW}", "avatar.report.compare tracking_benchmark"]
 
 
 def test_its_folder_is_no_subject(tmp_path: Path) -> None:

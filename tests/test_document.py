@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from avatar import document
-from avatar.config import RenderConfig, Settings, TrainConfig
+from avatar.config import RenderConfig, TrainConfig
+from avatar.settings import Settings
 from workflow import environment, settings
 
 PRESETS = sorted((document.ROOT / "config" / "presets").glob("*.yaml"))

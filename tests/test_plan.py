@@ -38,7 +38,7 @@ def variant_jobs(rules: str, variants: Iterable[str], subjects: Iterable[str] = 
     return {f"{rule} {subject}/{variant}" for rule in rules.split() for subject in subjects for variant in variants}
 
 
-TABLES = {"tabulate", "plot_speed"}
+TABLES = {"tabulate", "plot_speed", "index"}
 """What is made of all subjects together."""
 REPORTS = TABLES | jobs("plot page")
 
@@ -78,8 +78,9 @@ def pipeline(finished: Path, tmp_path: Path) -> Pipeline:
 
 def add_field(pipeline: Pipeline, model: str) -> None:
     """A new key with a default in a step's config."""
-    name = next(name for name in ("fitting/config.py", "avatar/config.py") if model in (pipeline.folder / name).read_text())
-    text = (pipeline.folder / name).read_text()
+    files = [path for part in ("fitting", "avatar") for path in (pipeline.folder / part).rglob("config.py")]
+    path = next(path for path in files if f"class {model}(" in path.read_text())
+    name, text = str(path.relative_to(pipeline.folder)), path.read_text()
     start = re.search(rf"^class {model}\(StepConfig\):\n(    \"\"\".*?\"\"\"\n)", text, re.M | re.S)
     pipeline.edit(name, start[0], start[0] + "    spare: int = 1\n")
 
@@ -122,7 +123,7 @@ def test_step_harness_help_text_and_device(pipeline: Pipeline) -> None:
 
 def test_new_field_concerns_its_own_step_only(pipeline: Pipeline) -> None:
     add_field(pipeline, "PageConfig")
-    assert pipeline.plan() == jobs("page")
+    assert pipeline.plan() == jobs("page") | {"index"}
 
 
 def test_extract(pipeline: Pipeline) -> None:
@@ -186,7 +187,7 @@ def test_metrics(pipeline: Pipeline) -> None:
 
 def test_plot(pipeline: Pipeline) -> None:
     add_field(pipeline, "PlotConfig")
-    assert pipeline.plan() == jobs("plot page") | {"plot_speed"}
+    assert pipeline.plan() == jobs("plot page") | {"plot_speed", "index"}
 
 
 def test_variant_added(pipeline: Pipeline) -> None:
@@ -202,7 +203,11 @@ def test_video_added(pipeline: Pipeline) -> None:
     result = pipeline.run()
     assert result.last_line == "3 of 3 subjects have an avatar"
     assert {line.split()[1] for line in pipeline.ran()} == {"cem", "all"}
-    assert sorted(line for line in pipeline.ran() if line.endswith(" all")) == ["avatar.plot all", "avatar.tabulate all"]
+    assert sorted(line for line in pipeline.ran() if line.endswith(" all")) == [
+        "avatar.report.index_page all",
+        "avatar.report.plot all",
+        "avatar.report.tabulate all",
+    ]
 
 
 def test_video_removed(pipeline: Pipeline) -> None:
@@ -251,7 +256,7 @@ def test_one_crash_among_three(tmp_path: Path, step: str) -> None:
     pipeline.forget()
     available = pipeline.run("available")
     assert available.code == 0, available.text
-    assert pipeline.ran() == ["avatar.tabulate all"]
+    assert pipeline.ran() == ["avatar.report.tabulate all"]
     table = (pipeline.folder / "results/tables/available.csv").read_text()
     assert table.count("metrics=results/ann/") == table.count("metrics=results/cem/") == 3
     pipeline.set_fate()

@@ -12,8 +12,8 @@ import pytest
 from matplotlib.figure import Figure
 from test_tabulate import result, write
 
-from avatar import figures, plot
-from avatar.config import PlotConfig
+from avatar.report import figures, plot
+from avatar.report.config import PlotConfig
 from workflow import step
 
 

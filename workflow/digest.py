@@ -5,8 +5,8 @@ step as a parameter. Starting at the step's file, imports are followed through t
 they stand; each file is parsed, docstrings are dropped, and the rest is written back in one normal form, so that comments,
 docstrings and formatting do not count.
 
-Left out on purpose: the harness (`workflow/step.py`) and the `config.py` files. What a config says reaches the rule as a
-parameter of its own, with defaults filled in.
+Left out on purpose: the harness (`workflow/step.py`), every `config.py` and `avatar/settings.py`. What a config says reaches the
+rule as a parameter of its own, with defaults filled in.
 
 Not seen: imports by a name computed at run time (name those modules in `extra`), data files, and installed packages.
 
@@ -25,7 +25,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("avatar", "fitting", "workflow")
-EXCLUDED = frozenset({"workflow.step", "fitting.config", "avatar.config"})
+EXCLUDED = frozenset({"workflow.step", "avatar.settings"})
 
 
 def code_digest(module: str, extra: tuple[str, ...] = (), root: Path = ROOT) -> str:
@@ -55,7 +55,7 @@ def closure(module: str, extra: tuple[str, ...] = (), root: Path = ROOT) -> dict
     while waiting:
         name = waiting.pop()
         path = _file_of(name, root)
-        if name in found or name in EXCLUDED or path is None:
+        if name in found or name in EXCLUDED or name.endswith(".config") or path is None:
             continue
         found[name] = path
         waiting.extend(_imported(name, path))

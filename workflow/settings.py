@@ -16,7 +16,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv")
-RESERVED_SUBJECTS = frozenset({"ablation", "plots", "tables", "tracking_benchmark"})
+RESERVED_SUBJECTS = frozenset({"ablation", "identity", "index", "plots", "published", "tables", "tracking_benchmark"})
 """Names under `results/` that belong to all subjects together."""
 RESERVED_VARIANTS = frozenset({"export", "fit", "frames", "landmarks", "matte", "page", "plots", "probe", "trim"})
 """Names under `results/{subject}/` that belong to all variants together."""
@@ -146,6 +146,23 @@ def check_names(names: Iterable[str], known: Iterable[str], key: str, origin: st
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
             hint = f"did you mean {near[0]}?" if near else f"the names there are {', '.join(known)}"
             raise SettingsError(f"{origin}: {key}.{name} is not known; {hint}")
+
+
+def check_drivers(drivers: Mapping[str, Any], subjects: Iterable[str], origin: str) -> None:
+    """Raise SettingsError for a driver whose name cannot be a folder's, whose subject has no video, or whose file is not there.
+
+    drivers: name -> model with `video` and `subject`.
+    """
+    subjects = sorted(subjects)
+    for name, driver in drivers.items():
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+            raise SettingsError(f"{origin}: drivers.{name}: use letters, digits, _ and - only, for it becomes a folder's name")
+        if driver.subject not in subjects:
+            near = difflib.get_close_matches(driver.subject, subjects, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]}?" if near else f"the subjects are {', '.join(subjects)}"
+            raise SettingsError(f"{origin}: drivers.{name}.subject: there is no subject {driver.subject}; {hint}")
+        if not Path(driver.video).expanduser().is_file():
+            raise SettingsError(f"{origin}: drivers.{name}.video: there is no file {driver.video}")
 
 
 def discover(folder: Path) -> dict[str, Path]:

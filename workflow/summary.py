@@ -31,18 +31,41 @@ def summary(subjects: Iterable[str], variants: Iterable[str], root: Path = Path(
     return [*lines, f"{done} of {len(subjects)} {noun} an avatar"]
 
 
+def failed_logs(
+    subjects: Iterable[str], variants: Iterable[str], predictors: Iterable[str], root: Path = Path(".")
+) -> list[Path]:
+    """Log of the first step that did not finish, for every subject and variant without scores; some may not be there.
+
+    variants: trained ones and predictors; the latter have no training.
+    """
+    logs, variants, predictors = [], list(variants), list(predictors)
+    for subject in subjects:
+        for variant in variants:
+            if (root / "results" / subject / variant / PER_VARIANT["evaluate"]).exists():
+                continue
+            steps = [name for name in PER_VARIANT if name != "train" or variant not in predictors]
+            if found := _unfinished(subject, [variant], root, steps):
+                logs.append(root / "logs" / subject / found[1])
+    return logs
+
+
+def _unfinished(subject: str, variants: list[str], root: Path, steps: Iterable[str] = PER_VARIANT) -> tuple[Path, str] | None:
+    """First product that does not exist, and the name of its step's log under `logs/{subject}/`."""
+    folder = root / "results" / subject
+    chain = [(folder / product, f"{step}.log") for step, product in PREPARATION.items()]
+    for variant in variants:
+        chain += [(folder / variant / PER_VARIANT[step], f"{variant}/{step}.log") for step in steps]
+    return next(((product, log) for product, log in chain if not product.exists()), None)
+
+
 def _missing(subject: str, variants: list[str], root: Path) -> str | None:
     """Why a subject has no avatar, or None when it has all of them."""
-    folder = root / "results" / subject
-    probe = folder / PREPARATION["probe"]
+    probe = root / "results" / subject / PREPARATION["probe"]
     if probe.is_file():
         content = json.loads(probe.read_text(encoding="utf-8"))
         if not content["accepted"]:
             return f"rejected: {content['reason']}"
-    chain = [(folder / product, f"{step}.log") for step, product in PREPARATION.items()]
-    for variant in variants:
-        chain += [(folder / variant / product, f"{variant}/{step}.log") for step, product in PER_VARIANT.items()]
-    for product, log in chain:
-        if not product.exists():
-            return f"not finished, {product.relative_to(root)} is missing; see {Path('logs') / subject / log}"
+    if found := _unfinished(subject, variants, root):
+        product, log = found
+        return f"not finished, {product.relative_to(root)} is missing; see {Path('logs') / subject / log}"
     return None

@@ -23,8 +23,8 @@ rule ablation_data:
         "logs/ablation/{subject}/data.log",
     params:
         config=ablation_data_config,
-        code=code_of("avatar.ablation_data"),
-        run=step("avatar.ablation_data"),
+        code=code_of("avatar.ablation.data"),
+        run=step("avatar.ablation.data"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"
 
@@ -47,8 +47,8 @@ rule ablation_truth:
         config=lambda wildcards: ablation_data_config(
             SimpleNamespace(subject=benchmark_settings.PREFIX + wildcards.clip)
         ),
-        code=code_of("avatar.ablation_truth"),
-        run=step("avatar.ablation_truth", subject="simulated"),
+        code=code_of("avatar.ablation.truth"),
+        run=step("avatar.ablation.truth", subject="simulated"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"
 
@@ -72,7 +72,7 @@ rule ablation_cell:
         config=ablation_config,
         code=ablation_code,
         asset=sha_of("lpips_alexnet.ckpt"),
-        run=step("avatar.ablation", one_thread=True),
+        run=step("avatar.ablation.cell", one_thread=True),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"
 
@@ -83,12 +83,13 @@ rule ablation:
     output:
         csv="results/ablation/ablation.csv",
         markdown="results/ablation/ablation.md",
+        latex="results/ablation/ablation.tex",
         plot="results/ablation/ablation.svg",
     log:
         "logs/ablation/table.log",
     params:
         config="{}",
-        code=code_of("avatar.ablation_table"),
-        run=step("avatar.ablation_table", subject="ablation"),
+        code=code_of("avatar.ablation.table"),
+        run=step("avatar.ablation.table", subject="ablation"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"

@@ -9,7 +9,7 @@ rule train:
         frames="results/{subject}/frames/frames.npy",
         alpha="results/{subject}/trim/alpha.npy",
         track="results/{subject}/fit/track.npz",
-        split="results/{subject}/split.json",
+        split=split_of,
     output:
         avatar="results/{subject}/{variant}/avatar.pt",
         curve="results/{subject}/{variant}/curve.tsv",
@@ -19,7 +19,7 @@ rule train:
     benchmark:
         "benchmarks/{subject}/{variant}/train.tsv"
     wildcard_constraints:
-        variant="|".join(map(re.escape, VARIANTS)),
+        variant="|".join(map(re.escape, TRAINED)),
     threads: 8
     resources:
         gpu=1,
@@ -49,7 +49,7 @@ rule render:
     benchmark:
         "benchmarks/{subject}/{variant}/render.tsv"
     wildcard_constraints:
-        variant="|".join(map(re.escape, VARIANTS)),
+        variant="|".join(map(re.escape, TRAINED)),
     threads: 8
     resources:
         gpu=1,
@@ -93,7 +93,7 @@ rule evaluate:
         render="results/{subject}/{variant}/render/test.npy",
         report="results/{subject}/{variant}/render/render.json",
         train=training_of,
-        lpips=asset("lpips_alexnet.ckpt"),
+        lpips=[asset(f"lpips_{network}.ckpt") for network in SETTINGS.evaluate.lpips],
     output:
         per_frame="results/{subject}/{variant}/metrics/per_frame.csv",
         metrics="results/{subject}/{variant}/metrics/metrics.json",
@@ -105,7 +105,7 @@ rule evaluate:
     params:
         config=config_of("evaluate"),
         code=code_of("avatar.evaluate"),
-        asset=sha_of("lpips_alexnet.ckpt"),
+        asset=" ".join(sha_of(f"lpips_{network}.ckpt") for network in SETTINGS.evaluate.lpips),
         run=step("avatar.evaluate"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"

@@ -1,4 +1,5 @@
-# The only place with Python: config checked, videos found, and the helpers that the rules share.
+# The only place with Python, with common_uses.smk and common_experiments.smk: config checked, videos found, and the helpers that
+# the rules share.
 # Parsed again by every cluster job: nothing here imports torch, and nothing prints.
 import atexit
 import hashlib
@@ -7,19 +8,15 @@ import shlex
 import sys
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 
-from snakemake.exceptions import WorkflowError
-
-from avatar import ablation_settings
-from avatar.config import RenderConfig, Settings, TrainConfig
+from avatar.config import RenderConfig, TrainConfig
+from avatar.settings import Settings
 from fitting import benchmark_settings
 from fitting.assets import ASSETS
-from fitting.config import BenchmarkConfig, SimulateConfig
 from workflow import settings as checks
 from workflow.digest import code_digest
 from workflow.settings import PREDICTORS
-from workflow.summary import summary
+from workflow.summary import failed_logs, summary
 
 CONFIG = "config/config.yaml or --config"
 try:
@@ -40,6 +37,7 @@ try:
             where = "; FLAME is at https://flame.is.tue.mpg.de (registration needed)"
             raise checks.SettingsError(f"{CONFIG}: head.{HEAD_KEYS[name]}: there is no file {path}{where}")
     VIDEOS = checks.discover(Path(SETTINGS.videos))
+    checks.check_drivers(SETTINGS.drivers, VIDEOS, CONFIG)
 except checks.SettingsError as mistake:
     raise SystemExit(str(mistake)) from None
 
@@ -47,15 +45,27 @@ HEAD = f"resources/heads/{SETTINGS.head.model}.npz"
 HEAD_SOURCE = {"anny": "fitting.anny_head", "flame": "fitting.flame"}[SETTINGS.head.model]
 SUBJECTS = list(VIDEOS)
 ALL_VARIANTS = [*VARIANTS, *PREDICTORS]
+DRIVER = "driver."  # before a driver's name: its video as a subject
+PUBLISHED = "published."  # before a comparison's name: its driving panel as a subject
+# `snakemake half_data` trains every variant once more, on the first half of its frames. A variant's own name has no dot.
+HALF = ".half"
+TRAINED = VARIANTS | {name + HALF: keys for name, keys in VARIANTS.items()}
 # Once a run: an edit while it runs counts in the next one.
 digest_of = cache(code_digest)
 PYTHON = shlex.quote(sys.executable)
 
 
-# A simulated clip is a subject too, but none of `all`.
+# A simulated clip, a driving video and a comparison's driving panel are subjects too, but none of `all`.
 wildcard_constraints:
-    subject="|".join([*map(re.escape, SUBJECTS), re.escape(benchmark_settings.PREFIX) + r"[a-z]+_\d+[a-z0-9_]*"]),
-    variant="|".join(map(re.escape, ALL_VARIANTS)),
+    subject="|".join(
+        [
+            *map(re.escape, [*SUBJECTS, *(PUBLISHED + name for name in SETTINGS.comparisons)]),
+            *(re.escape(DRIVER + name) for name in SETTINGS.drivers),
+            re.escape(benchmark_settings.PREFIX) + r"[a-z]+_\d+[a-z0-9_]*",
+        ]
+    ),
+    comparison="|".join(map(re.escape, SETTINGS.comparisons)) or "(?!)",
+    variant="|".join(map(re.escape, [*TRAINED, *PREDICTORS])),
     predictor="|".join(PREDICTORS),
     asset="|".join(map(re.escape, ASSETS)),
 
@@ -74,7 +84,7 @@ def step(name, subject=None, device=False, one_thread=False):
     """
 
     def call(wildcards, input, output, threads):
-        who = subject or wildcards.get("subject") or wildcards.asset
+        who = subject or wildcards.get("subject") or wildcards.get("comparison") or wildcards.asset
         where = f" --device {shlex.quote(SETTINGS.device)}" if device else ""
         files = f"--input {named(input)} --output {named(output)}"
         count = 1 if one_thread else threads
@@ -91,12 +101,13 @@ def config_of(step):
 
 def variant_config(step):
     """As `config_of`, for the steps that a preset configures."""
-    return lambda wildcards: VARIANTS[wildcards.variant][step].model_dump_json()
+    return lambda wildcards: TRAINED[wildcards.variant][step].model_dump_json()
 
 
 def predictor_config(wildcards):
-    """A predictor takes the frames that the first variant renders."""
-    max_frames = next(iter(VARIANTS.values()))["render"].max_frames
+    """A predictor takes the frames that the first variant renders; of a comparison's driving panel all."""
+    whole = wildcards.subject.startswith(PUBLISHED)
+    max_frames = None if whole else next(iter(VARIANTS.values()))["render"].max_frames
     return json.dumps({"predictor": wildcards.predictor, "max_frames": max_frames})
 
 
@@ -114,7 +125,7 @@ def model_code_of(command):
     """As `code_of`, with the module of the variant's representation, which is imported by name."""
 
     def code(wildcards):
-        representation = VARIANTS[wildcards.variant]["train"].representation
+        representation = TRAINED[wildcards.variant]["train"].representation
         return digest_of(command, (f"avatar.features.{representation}",))
 
     return code
@@ -151,85 +162,27 @@ def video_of(wildcards):
     """The subject's video. A user's own counts by content (see `content_of_video`), not by time."""
     if wildcards.subject in VIDEOS:
         return ancient(str(VIDEOS[wildcards.subject]))
+    if wildcards.subject.startswith(DRIVER):
+        return ancient(str(driver_video(wildcards.subject)))
+    if wildcards.subject.startswith(PUBLISHED):
+        return f"results/published/{wildcards.subject.removeprefix(PUBLISHED)}/driving.mp4"
     return f"simulated/videos/{wildcards.subject.removeprefix(benchmark_settings.PREFIX)}.mp4"
 
 
 def content_of_video(wildcards):
     """Fingerprint of the video: touching or copying it changes nothing, another video does."""
-    return checks.fingerprint(VIDEOS[wildcards.subject]) if wildcards.subject in VIDEOS else "simulated"
+    if wildcards.subject.startswith(DRIVER):
+        return checks.fingerprint(driver_video(wildcards.subject))
+    made = "published" if wildcards.subject.startswith(PUBLISHED) else "simulated"
+    return checks.fingerprint(VIDEOS[wildcards.subject]) if wildcards.subject in VIDEOS else made
 
 
-def simulate_config(wildcards):
-    """What the config says of simulated videos, and over it what the video's name says: KIND_SEED[_FRAMES][_HAIR]."""
-    named = {"kind": wildcards.kind, "seed": int(wildcards.seed)}
-    for word in wildcards.options.split("_")[1:]:
-        named |= {"frames": int(word)} if word.isdecimal() else {"hair": word}
-    return SimulateConfig(**SETTINGS.simulate.model_dump() | named).model_dump_json()
-
-
-def truth_of(wildcards):
-    """The truth of a simulated clip, where the head that is fitted has the same vertices."""
-    clip = wildcards.subject.removeprefix(benchmark_settings.PREFIX)
-    known = wildcards.subject not in VIDEOS and SETTINGS.head.model == "anny"
-    return {"truth": f"simulated/truth/{clip}.npz"} if known else {}
-
-
-def benchmark_config(wildcards):
-    """The setting that the file's name says, on the shipped config: the user's own fit keys do not count here."""
-    fit = benchmark_settings.SETTINGS[wildcards.setting].fit
-    frames = benchmark_settings.frames_of(wildcards.subject, wildcards.setting)
-    return BenchmarkConfig(fit=fit, frames=frames, simulated=wildcards.subject not in VIDEOS).model_dump_json()
-
-
-def benchmark_rows(wildcards):
-    """Rows of the benchmark: simulated clips, and the first of the user's own that have a face."""
-    own = list(filter(accepted, sorted(SUBJECTS)[: max(benchmark_settings.REAL_CLIPS.values())]))
-    pattern = "results/tracking_benchmark/rows/{}/{}.json"
-    return [pattern.format(*row) for row in benchmark_settings.planned(own)]
-
-
-def of_simulated(content):
-    """The paths by name for a simulated subject, with its clip's name filled in; nothing for a real one."""
-
-    def paths(wildcards):
-        clip = wildcards.subject.removeprefix(benchmark_settings.PREFIX)
-        return {name: path.format(clip=clip) for name, path in content.items()} if clip != wildcards.subject else {}
-
-    return paths
-
-
-def ablation_data_config(wildcards):
-    """Size and frames, the config's trim keys, and what a simulated clip was made from."""
-    clip = re.fullmatch(rf"{re.escape(benchmark_settings.PREFIX)}([a-z]+)_(\d+)(\w*)", wildcards.subject)
-    made = clip and simulate_config(SimpleNamespace(kind=clip[1], seed=clip[2], options=clip[3]))
-    return ablation_settings.data_config(SETTINGS.trim, made).model_dump_json()
-
-
-def ablation_inputs(wildcards):
-    """What a cell trains on: tracked or true parameters, all or half of the frames; doubled codes where their truth is known."""
-    folder, group = f"results/ablation/data/{wildcards.subject}", ablation_settings.CELLS[wildcards.cell].group
-    own = {"head": f"{folder}/true_head.npz", "track": f"{folder}/true_track.npz"}
-    tracked = {"head": HEAD, "track": f"{folder}/track.npz"}
-    split = {"split": f"{folder}/{ {'half': 'half', 'overfit': 'four'}.get(group, 'split') }.json"}
-    doubled = {} if group == "overfit" else of_simulated({"doubled": f"{folder}/doubled.npz"})(wildcards)
-    return (own if group in ("true", "overfit") else tracked) | split | doubled
-
-
-def ablation_config(wildcards):
-    """The cell that the file's name says: the user's own train keys do not count here."""
-    return ablation_settings.config_of(wildcards.cell, int(wildcards.seed)).model_dump_json()
-
-
-def ablation_code(wildcards):
-    """As `model_code_of`, for the cell's representation."""
-    representation = ablation_settings.CELLS[wildcards.cell].representation
-    return digest_of("avatar.ablation", (f"avatar.features.{representation}",))
-
-
-def ablation_rows(wildcards):
-    """Rows of the simulated subject and of the user's own that have a face."""
-    pattern = "results/ablation/rows/{}/{}/{}.json"
-    return [pattern.format(*row) for row in ablation_settings.planned(list(filter(accepted, SUBJECTS)))]
+def split_config(wildcards):
+    """The config's split, but of a comparison's driving panel exactly its test frames."""
+    name = wildcards.subject.removeprefix(PUBLISHED)
+    if name == wildcards.subject:
+        return SETTINGS.split.model_dump_json()
+    return SETTINGS.split.model_copy(update={"test_frames": SETTINGS.comparisons[name].test_frames}).model_dump_json()
 
 
 def accepted(subject):
@@ -246,26 +199,16 @@ def page_of(subject):
     return lambda wildcards: f"results/{subject}/page" if accepted(subject) else f"results/{subject}/probe/probe.json"
 
 
-def exportable_head(wildcards):
-    """The head model, where other programs know its codes."""
-    if SETTINGS.head.model == "anny":
-        raise WorkflowError(
-            "export: the track of the default head (head.model: anny) cannot be written as FLAME codes; "
-            "set head.model: flame and head.path, your own FLAME file, and run snakemake again"
-        )
-    return HEAD
-
-
-def export_of(subject):
-    """What `export_all` wants of a subject; a rejected one has nothing to export."""
-    exportable_head(None)
-    return f"results/{subject}/export/export.json" if accepted(subject) else []
-
-
 def training_of(wildcards):
     """Report of the training behind a render; a predictor has none."""
     pattern = "results/{subject}/{variant}/train.json"
-    return expand(pattern, **wildcards) if wildcards.variant in VARIANTS else []
+    return expand(pattern, **wildcards) if wildcards.variant in TRAINED else []
+
+
+def split_of(wildcards):
+    """The frames that train and test: of a variant on half of the data those of the first half."""
+    half = "_half" if wildcards.variant.endswith(HALF) else ""
+    return f"results/{wildcards.subject}/split{half}.json"
 
 
 def of_accepted(pattern):
@@ -283,13 +226,20 @@ def of_subject(pattern, variants):
 
 
 def tabulate_existing(wildcards, threads):
-    """As `step`, for a table of what exists now."""
-    probes = [path for path in expand("results/{subject}/probe/probe.json", subject=SUBJECTS) if Path(path).exists()]
-    pattern = "results/{subject}/{variant}/metrics/metrics.json"
-    metrics = [path for path in expand(pattern, subject=SUBJECTS, variant=ALL_VARIANTS) if Path(path).exists()]
-    input = {"probes": probes, "metrics": metrics}
-    output = {"csv": "results/tables/available.csv", "markdown": "results/tables/available.md"}
-    return step("avatar.tabulate", subject="all")({}, input, output, threads)
+    """As `step`, for tables of what exists now; where scores are missing, the log of the step that did not finish."""
+    existing = lambda paths: [path for path in paths if Path(path).exists()]  # noqa: E731
+    of_all = {"subject": SUBJECTS, "variant": ALL_VARIANTS}
+    input = {
+        "probes": existing(expand("results/{subject}/probe/probe.json", subject=SUBJECTS)),
+        "per_frames": existing(expand("results/{subject}/{variant}/metrics/per_frame.csv", **of_all)),
+        "metrics": existing(expand("results/{subject}/{variant}/metrics/metrics.json", **of_all)),
+        "logs": existing(dict.fromkeys(map(str, failed_logs(SUBJECTS, ALL_VARIANTS, PREDICTORS)))),
+    }
+    names = {"csv": "available.csv", "per_frame": "available_per_frame.csv"}
+    for prefix, name in {"": "available", "regions_": "available_regions"}.items():
+        names |= {f"{prefix}markdown": f"{name}.md", f"{prefix}latex": f"{name}.tex"}
+    output = {name: f"results/tables/{file}" for name, file in names.items()}
+    return step("avatar.report.tabulate", subject="all")({}, input, output, threads)
 
 
 def summarise_at_exit():

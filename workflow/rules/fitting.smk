@@ -89,7 +89,7 @@ rule split:
     log:
         "logs/{subject}/split.log",
     params:
-        config=config_of("split"),
+        config=split_config,
         code=code_of("fitting.split"),
         run=step("fitting.split"),
     shell:

@@ -23,8 +23,8 @@ rule plot:
         "logs/{subject}/plot.log",
     params:
         config=config_of("plot"),
-        code=code_of("avatar.plot"),
-        run=step("avatar.plot"),
+        code=code_of("avatar.report.plot"),
+        run=step("avatar.report.plot"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"
 
@@ -44,8 +44,8 @@ rule plot_speed:
         "logs/plot_speed.log",
     params:
         config=config_of("plot"),
-        code=code_of("avatar.plot"),
-        run=step("avatar.plot", subject="all"),
+        code=code_of("avatar.report.plot"),
+        run=step("avatar.report.plot", subject="all"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"
 
@@ -77,15 +77,39 @@ rule page:
         "logs/{subject}/page.log",
     params:
         config=config_of("page"),
-        code=code_of("avatar.page"),
-        run=step("avatar.page"),
+        code=code_of("avatar.report.page"),
+        run=step("avatar.report.page"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"
+
+
+# The page over all subjects. Its links work from disk and inside report.zip (see avatar/report/index_page.py).
+rule index:
+    input:
+        table="results/tables/metrics.csv",
+        pages=lambda wildcards: expand("results/{subject}/page", subject=filter(accepted, SUBJECTS)),
+        plots="results/plots/speed.svg",
+    output:
+        page=report(
+            directory("results/index"),
+            htmlindex="index.html",
+            caption="../report/index.rst",
+            category="Avatar",
+            labels={"subject": "all", "figure": "page"},
+        ),
+    log:
+        "logs/index.log",
+    params:
+        code=code_of("avatar.report.index_page"),
+        run=step("avatar.report.index_page", subject="all"),
+    shell:
+        "{params.run} --code {params.code} > {log:q} 2>&1"
 
 
 rule tabulate:
     input:
         probes=expand("results/{subject}/probe/probe.json", subject=SUBJECTS),
+        per_frames=of_accepted("results/{subject}/{variant}/metrics/per_frame.csv"),
         metrics=of_accepted("results/{subject}/{variant}/metrics/metrics.json"),
     output:
         csv=report(
@@ -94,13 +118,17 @@ rule tabulate:
             category="Metrics",
             labels={"figure": "table"},
         ),
+        per_frame="results/tables/per_frame.csv",
         markdown="results/tables/metrics.md",
+        latex="results/tables/metrics.tex",
+        regions_markdown="results/tables/regions.md",
+        regions_latex="results/tables/regions.tex",
     log:
         "logs/tabulate.log",
     params:
         config=table_config,
-        code=code_of("avatar.tabulate"),
-        run=step("avatar.tabulate", subject="all"),
+        code=code_of("avatar.report.tabulate"),
+        run=step("avatar.report.tabulate", subject="all"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"
 
@@ -111,7 +139,7 @@ rule available:
         "logs/available.log",
     params:
         config=table_config,
-        code=code_of("avatar.tabulate"),
+        code=code_of("avatar.report.tabulate"),
         run=tabulate_existing,
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1 && cat results/tables/available.md"

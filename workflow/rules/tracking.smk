@@ -38,7 +38,7 @@ rule tracking_benchmark:
         "logs/tracking_benchmark/compare.log",
     params:
         config="{}",
-        code=code_of("avatar.compare"),
-        run=step("avatar.compare", subject="tracking_benchmark"),
+        code=code_of("avatar.report.compare"),
+        run=step("avatar.report.compare", subject="tracking_benchmark"),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"

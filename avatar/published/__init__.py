@@ -1,0 +1,1 @@
+"""Our renders and published ones on the same frames of a comparison video."""

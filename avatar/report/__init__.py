@@ -1,0 +1,1 @@
+"""Numbers and pictures -> tables, plots, pages."""
