@@ -44,3 +44,4 @@ onsuccess:
 
 onerror:
     summarise_at_exit()
+    make_available()

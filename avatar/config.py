@@ -1,4 +1,4 @@
-"""Typed config of the steps from tracked head to numbers, and the whole `config.yaml`. No torch.
+"""Typed config of the steps from tracked head to scores. No torch.
 
 A variant is a preset (`config/presets/NAME.yaml`) plus overrides of *avatar* keys; data preparation has its own keys, shared
 by all variants, and no preset touches it.

@@ -70,7 +70,7 @@ def images(array: np.ndarray, device: str) -> Tensor:
 def score(
     truth: Tensor, render: Tensor, alpha: Tensor, hulls: list[np.ndarray | None], network: lpips.Lpips
 ) -> list[dict[str, float]]:
-    """`score_regions` with masks bool [H, W] for faces, None for no face, and AlexNet alone."""
+    """`score_regions` inside one mask bool [H, W] a frame, under the name of the face (None: none), with AlexNet alone."""
     found = [Regions(face=hull, notes=()) for hull in hulls]
     return score_regions(truth, render, alpha, found, {"lpips": network})
 

@@ -60,12 +60,16 @@ def check(video_path: Path | str, avatar_path: Path | str) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Print what a video says of itself; with an avatar, exit status 1 unless that avatar rendered it."""
-    video, *avatars = sys.argv[1:] if argv is None else argv
-    print(read_comment(video) or "no comment")
+    words = sys.argv[1:] if argv is None else argv
+    if len(words) not in (1, 2):
+        print("usage: python -m avatar.provenance VIDEO [AVATAR]", file=sys.stderr)
+        return 2
+    video, *avatars = words
     try:
+        print(read_comment(video) or "no comment")
         for path in avatars:
             check(video, path)
-    except ValueError as error:
+    except (OSError, ValueError, av.error.FFmpegError) as error:
         print(error, file=sys.stderr)
         return 1
     return 0

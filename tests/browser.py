@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import os
 import select
@@ -27,6 +28,8 @@ LAUNCH = """import fcntl, os, sys
 ends = [fcntl.fcntl(int(end), fcntl.F_DUPFD, 10) for end in sys.argv[1:3]]
 os.dup2(ends[0], 3), os.dup2(ends[1], 4)
 os.execv(sys.argv[3], sys.argv[3:])"""
+PATIENCE_S = 120
+"""Two busy cores take 20 s to start a browser and 30 s to load a page with videos (seen); a long wait costs a failure alone."""
 KEYS = {" ": ("Space", 32), "ArrowLeft": ("ArrowLeft", 37), "ArrowRight": ("ArrowRight", 39), "Home": ("Home", 36),
         "End": ("End", 35), "Tab": ("Tab", 9)}  # fmt: skip
 
@@ -63,7 +66,8 @@ class Browser:
         """End the browser and its children, which share a process group."""
         os.close(self._write)
         os.close(self._read)
-        os.killpg(self._process.pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):  # it may have ended by itself
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
     def _message(self, end: float) -> dict[str, Any]:
@@ -77,7 +81,7 @@ class Browser:
         text, _, self._rest = self._rest.partition(b"\0")
         return json.loads(text)
 
-    def call(self, method: str, timeout_s: float = 60, **parameters: Any) -> dict[str, Any]:
+    def call(self, method: str, timeout_s: float = PATIENCE_S, **parameters: Any) -> dict[str, Any]:
         """One command and its result; events that come meanwhile are kept."""
         self._count += 1
         message = {"id": self._count, "method": method, "params": parameters}
@@ -97,14 +101,18 @@ class Browser:
             raise RuntimeError(f"{script}: {done['exceptionDetails']}")
         return done["result"].get("value")
 
-    def wait(self, script: str, until: Callable[[Any], bool] = bool, timeout_s: float = 30) -> Any:
-        """Ask again and again until the expression's value will do."""
-        end = time.monotonic() + timeout_s
-        while not until(value := self.run(script)):
-            if time.monotonic() > end:
-                raise TimeoutError(f"{script} is {value!r} after {timeout_s} s")
+    def wait(self, script: str, until: Callable[[Any], bool] = bool, timeout_s: float = PATIENCE_S) -> Any:
+        """Ask again and again until the expression's value will do; a question that the next page interrupts is asked anew."""
+        end, value = time.monotonic() + timeout_s, None
+        while time.monotonic() < end:
+            try:
+                if until(value := self.run(script)):
+                    return value
+            except RuntimeError as error:
+                if "navigated" not in str(error):
+                    raise
             time.sleep(0.03)
-        return value
+        raise TimeoutError(f"{script} is {value!r} after {timeout_s} s")
 
     def open(self, page: Path, width: int = 1280, height: int = 900, dark: bool = False) -> None:
         """Load a file in a window of this size, with the console emptied before."""

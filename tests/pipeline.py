@@ -41,8 +41,8 @@ if fate == "sleep in " + step:
     time.sleep(60)
 for name, path in outputs.items():
     os.makedirs(os.path.dirname(path) or ".", exist_ok=True)
-    if name == "page":
-        os.makedirs(path)
+    if name in ("page", "png"):
+        os.makedirs(path, exist_ok=True)
         path = os.path.join(path, "index.html")
     content = dict(accepted=fate != "reject", reason="no face in 62 % of the frames") if name == "probe" else sys.argv
     with open(path, "w") as file:

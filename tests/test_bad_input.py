@@ -129,6 +129,10 @@ def test_decomposed_and_composed_letters_are_one_subject(tmp_path: Path) -> None
     assert settings.subject_name("Zoe\u0308") == settings.subject_name("Zoë") == "Zoë"
 
 
+def test_no_subject_looks_like_an_option() -> None:
+    assert [settings.subject_name(stem) for stem in ("-x", "- ann", "_-1-", "---")] == ["x", "ann", "1-", ""]
+
+
 def test_a_mistake_in_the_config_leaves_what_is_made(pipeline: Pipeline) -> None:
     pipeline.add_video("ann")
     assert pipeline.run().code == 0

@@ -141,6 +141,8 @@ def test_lost_frames_are_bridged_before_anything_is_smoothed() -> None:
     usable = np.arange(9) != 4
     smooth = motion.smoothed(retarget.bridged(broken, usable), 0.04)
     assert np.abs(smooth.translation).max() < 1
+    some = [False, True, False, False, False, True, False, False, False]
+    assert retarget.bridged(own, some).jaw.tolist() == own.jaw[[1, 1, 1, 1, 5, 5, 5, 5, 5]].tolist()
     with pytest.raises(ValueError, match="none of the frames is usable"):
         retarget.bridged(own, np.zeros(9, bool))
 
@@ -171,18 +173,24 @@ def changed(toy: dict[str, Path], folder: Path, **arrays: np.ndarray) -> dict[st
 def test_the_step(toy: dict[str, Path], tmp_path: Path) -> None:
     usable = np.arange(10) != 3
     shape = np.load(toy["track"])["shape"] + np.float32(0.1)
-    outputs = drive_in(tmp_path, changed(toy, tmp_path, usable=usable, shape=shape))
+    outputs = drive_in(tmp_path, changed(toy, tmp_path, usable=usable, shape=shape), max_frames=3)
     report = json.loads(outputs["report"].read_text())
-    assert report["frames"] == [0, 4, 6, 9] and report["left_out"]["count"] == 1
-    assert report["fps"] == pytest.approx(25 * 4 / 9, abs=1e-3)
+    assert report["frames"] in ([4, 6, 8], [5, 7, 9]) and report["left_out"]["count"] == 1  # frame 3 is in no stretch
+    assert report["fps"] == 12.5
     assert report["identity"]["verdict"] == "same" and report["identity"]["distance"] == pytest.approx(0.1, abs=1e-4)
     assert set(report["identity"]["distances"]) == {"codes", "face_mm", "head_mm"}
-    assert report["synthetic"] and report["renders"] == 8
+    assert report["synthetic"] and report["renders"] == 6
     provenance.check(outputs["video"], toy["avatar"])
     pictures = [frame.rgb() for frame in read_frames(outputs["video"])]
-    assert len(pictures) == 4 and pictures[0].shape[1] > 4 * 24
-    assert inspect(outputs["video"]).fps == pytest.approx(25 * 4 / 9, rel=0.01)
+    assert len(pictures) == 3 and pictures[0].shape[1] > 4 * 24
+    assert inspect(outputs["video"]).fps == pytest.approx(12.5, rel=0.01)
     assert outputs["strip"].stat().st_size > 1000
+
+
+def test_all_usable_frames_at_full_rate(toy: dict[str, Path], tmp_path: Path) -> None:
+    usable = np.arange(10) != 3
+    report = json.loads(drive_in(tmp_path, changed(toy, tmp_path, usable=usable), max_frames=None)["report"].read_text())
+    assert report["frames"] == np.flatnonzero(usable).tolist() and report["fps"] == 25
 
 
 def test_another_person_is_refused_unless_allowed(toy: dict[str, Path], tmp_path: Path) -> None:
@@ -194,6 +202,18 @@ def test_another_person_is_refused_unless_allowed(toy: dict[str, Path], tmp_path
     assert report["identity"]["verdict"] == "other" and report["identity"]["allow_other_identity"]
     report = json.loads(drive_in(tmp_path, other, identity_limit=0.6, max_frames=1)["report"].read_text())
     assert report["identity"]["verdict"] == "doubtful"
+
+
+def test_a_limit_of_another_head_model_is_warned_of(
+    toy: dict[str, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    words = "the limit is that of head model anny, not of toy: set drive.identity_limit"
+    found = []
+    for keys in ({}, {"identity_limit": 0.4}):
+        drive_in(tmp_path, toy, max_frames=1, **keys)
+        found.append(words in caplog.text)
+        caplog.clear()
+    assert found == [True, False]
 
 
 def test_a_driver_that_cannot_drive(toy: dict[str, Path], tmp_path: Path) -> None:

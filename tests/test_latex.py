@@ -115,7 +115,7 @@ def test_tables_are_sound_whatever_the_names(tmp_path: Path) -> None:
         check(text[name])
         assert len(rows_of(text[name])) == 3  # nine subjects and their mean, four beside each other
         assert latex.escape(NASTY) in text[name] and r"rejected\textsuperscript" in text[name]
-        assert r"failed\textsuperscript" in text[name] and "logs/Zoë/demo\\_a/" in text[name]
+        assert "not made" in text[name]
 
 
 def test_layout_of_table_1(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Motions: taken, scaled, smoothed and put together; rotations against scipy's own mean."""
+"""Motions: taken, scaled and smoothed; rotations against scipy's own mean."""
 
 from __future__ import annotations
 
@@ -96,18 +96,12 @@ def test_smoothing_lowers_jitter_and_leaves_slow_motion() -> None:
     assert np.abs(low - slow)[10:-10].max() < 0.03
 
 
-def test_parts_of_two_motions() -> None:
-    pose, face = made(seed=1), made(seed=2)
-    both = motion.combined(pose, face)
+def test_some_frames_of_a_motion() -> None:
+    own = made()
+    some = own.take([6, 0, 6], fps=5.0)
+    assert len(some) == 3 and some.fps == 5.0 and own.take([1]).fps == own.fps
     for name in PARTS:
-        source = pose if name in ("rotation", "neck", "translation") else face
-        np.testing.assert_array_equal(getattr(both, name), getattr(source, name))
-    with pytest.raises(ValueError, match="12 and 5 frames"):
-        motion.combined(pose, face.take(range(5)))
-    long = motion.joined([pose, face.take([3, 3])])
-    assert len(long) == 14 and long.fps == pose.fps
-    np.testing.assert_array_equal(long.eyes[12:], face.eyes[[3, 3]])
-    assert pose.take([0, 6], fps=5.0).fps == 5.0
+        np.testing.assert_array_equal(getattr(some, name), getattr(own, name)[[6, 0, 6]])
 
 
 def test_nearest_rotation_is_one_even_of_a_reflection() -> None:

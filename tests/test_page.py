@@ -175,6 +175,7 @@ def test_a_region_that_one_variant_lacks_is_said_and_one_that_all_lack_is_left_o
     _, parts = page_scores.tables(metrics)
     assert [group["title"] for group in parts["groups"]] == ["face hull", "mouth box"]
     assert [cell["value"] for cell in parts["rows"][1]["cells"][5:]] == ["no mouth"] * 5
+    assert [cell["best"] for cell in parts["rows"][0]["cells"]] == [True] * 5 + [False] * 5  # one figure is the best of nothing
     for scores in metrics.values():
         scores["metrics"] = {
             name: value for name, value in scores["metrics"].items() if "_face" not in name and "_mouth" not in name

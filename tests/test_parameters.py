@@ -92,8 +92,14 @@ def test_npz_of_named_arrays(tmp_path: Path) -> None:
     np.savez(path, jawOpen=np.zeros((3, 2)))
     with pytest.raises(ParameterError, match="one number a frame"):
         read(path)
-    path.write_bytes(b"no archive")
-    with pytest.raises(ParameterError, match="not readable as NPZ"):
+    whole = path.read_bytes()
+    for content in (b"no archive", b"", whole[: len(whole) // 2]):
+        path.write_bytes(content)
+        with pytest.raises(ParameterError, match="not readable as NPZ"):
+            read(path)
+    with open(path, "wb") as file:
+        np.save(file, np.zeros((3, 2)))
+    with pytest.raises(ParameterError, match="one array without a name"):
         read(path)
 
 
@@ -105,6 +111,8 @@ def test_times_are_resampled_and_rotations_turn_the_short_way(file: Path) -> Non
     np.testing.assert_allclose(way.sum(), 2 * np.pi - 6.2, atol=1e-6)  # 5 degrees, not 355 back
     assert len(read(file, "time_s,jawOpen\n3,0.5\n").motion) == 1
     assert len(read(file, "time_s,jawOpen\n0,0\n0.11,1\n", fps=10.0).motion) == 2  # never beyond the last row
+    with pytest.raises(ParameterError, match="33 s apart; if these are milliseconds"):
+        read(file, "time_s,jawOpen\n0,0\n33,1\n66,1\n")
     with pytest.raises(ParameterError, match="row 3 of column time_s is 1, not after the row before it"):
         read(file, "time_s,jawOpen\n0,0\n1,0\n1,0\n")
 

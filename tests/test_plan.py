@@ -250,13 +250,15 @@ def test_one_crash_among_three(tmp_path: Path, step: str) -> None:
     result = pipeline.run()
     assert result.code != 0
     assert result.last_line == "2 of 3 subjects have an avatar"
-    assert f"see logs/bob/{step.partition('.')[2]}.log" in result.text
+    log = f"logs/bob/{step.partition('.')[2]}.log"
+    assert f"see {log}" in result.text and "what exists: results/tables/available.md" in result.text
+    assert f"logs={log}" in (pipeline.folder / "results/tables/available.md").read_text()
     for subject in ("ann", "cem"):
         assert (pipeline.folder / "results" / subject / "page" / "index.html").exists(), result.text
     pipeline.forget()
     available = pipeline.run("available")
     assert available.code == 0, available.text
-    assert pipeline.ran() == ["avatar.report.tabulate all"]
+    assert pipeline.ran() == ["avatar.report.tabulate all", "avatar.report.index_page all"]
     table = (pipeline.folder / "results/tables/available.csv").read_text()
     assert table.count("metrics=results/ann/") == table.count("metrics=results/cem/") == 3
     pipeline.set_fate()

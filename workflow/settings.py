@@ -16,10 +16,16 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv")
-RESERVED_SUBJECTS = frozenset({"ablation", "identity", "index", "plots", "published", "tables", "tracking_benchmark"})
+RESERVED_SUBJECTS = frozenset(
+    {"ablation", "available", "identity", "index", "plots", "published", "tables", "tracking_benchmark"}
+)
 """Names under `results/` that belong to all subjects together."""
-RESERVED_VARIANTS = frozenset({"export", "fit", "frames", "landmarks", "matte", "page", "plots", "probe", "trim"})
-"""Names under `results/{subject}/` that belong to all variants together."""
+RESERVED_VARIANTS = frozenset(
+    {"export", "fit", "frames", "landmarks", "matte", "page", "plots", "probe", "trim"}
+    | {"animate", "drive", "metrics", "render"}
+)
+"""Names under `results/{subject}/` that belong to all variants together, and folders of a variant by which a path is understood
+(`avatar.report.results`, `avatar.report.uses_page`)."""
 PREDICTORS = ("mean_frame", "nearest_frame")
 """Trivial predictors that stand beside the avatars in every table."""
 
@@ -190,8 +196,11 @@ def discover(folder: Path) -> dict[str, Path]:
 
 
 def subject_name(stem: str) -> str:
-    """A file's stem as a folder's name: letters of any script, digits, `_` and `-` stay; runs of anything else become `_`."""
-    return re.sub(r"[^\w-]+", "_", unicodedata.normalize("NFC", stem)).strip("_")
+    """A file's stem as a folder's name: letters of any script, digits, `_` and `-` stay; runs of anything else become `_`.
+
+    No name begins with `-`: on a command line it would be an option.
+    """
+    return re.sub(r"[^\w-]+", "_", unicodedata.normalize("NFC", stem)).lstrip("-_").rstrip("_")
 
 
 def fingerprint(path: Path, sample_bytes: int = 1 << 20) -> str:

@@ -30,7 +30,7 @@ class PanelsConfig(StepConfig):
 
 
 class ComparisonConfig(PanelsConfig):
-    """A comparison video of published methods, and which of its frames test."""
+    """comparisons: a comparison video of published methods, and which of its frames test. One entry a video."""
 
     video: str = Field(description="The comparison video.")
     test_frames: int = Field(150, ge=1, description="Exactly this many last frames test; all before them may train.")

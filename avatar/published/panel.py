@@ -1,4 +1,4 @@
-"""Step: the driving panel of a comparison video as a video of its own, every pixel and frame kept.
+"""Step `published_panel`: the driving panel of a comparison video as a video of its own, every pixel and frame kept.
 
     python -m avatar.published.panel --config '{"panels": ["driving", "NerFACE"], "driving": "driving", "test_frames": 150}' \\
         --input video=comparison.mp4 --output video=results/published/nerface/driving.mp4

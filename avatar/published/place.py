@@ -1,4 +1,4 @@
-"""Step: test frames of a trivial predictor in the pixels of a comparison video's driving panel.
+"""Step `published_place`: test frames of a trivial predictor in the pixels of a comparison video's driving panel.
 
 Input: index (frames.json), split, render, report (of step `baseline`). Output: png, opacity, report, as `published_render` has.
 """

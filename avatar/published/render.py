@@ -1,4 +1,4 @@
-"""Step: test frames of an avatar in the pixels of a comparison video's driving panel, as PNGs under the video's frame numbers.
+"""Step `published_render`: test frames of an avatar in the pixels of a comparison video's driving panel, as PNGs.
 
 Input: head, avatar, index (frames.json), track, split. Output: png (folder of NNNNN.png, on white), opacity (npy), report.
 A crop that the pipeline shrank is rendered as filmed: the camera takes the panel's own pixels, nothing is resampled.

@@ -1,4 +1,4 @@
-"""Step: scores of one method of a comparison on the test frames: a published panel, or pictures that were rendered here.
+"""Step `published_score`: scores of one method of a comparison: a published panel, or pictures that were rendered here.
 
 Input: video (the comparison), index (frames.json), matte, trim, landmarks, track, split, lpips; for pictures png, opacity and
 report, and train (train.json) where there is a training. Output: per_frame (csv), metrics (json).

@@ -1,4 +1,4 @@
-"""Step: a few test frames of a comparison as one picture: the driving panel, our avatars, the published renders.
+"""Step `published_strip`: a few test frames as one picture: the driving panel, our avatars, the published renders.
 
 Input: video (the comparison), png (one folder a variant), avatars (their files, in the same order). Output: picture (PNG).
 """
@@ -18,19 +18,10 @@ from avatar.published.config import PublishedStripConfig
 from avatar.published.protocol import read_panels
 from avatar.report.pictures import strip
 from avatar.report.results import many
+from avatar.uses.shading import captioned
 from workflow import step
 
 ROWS = 4
-LABEL_PX = 28
-
-
-def labelled(image: np.ndarray, text: str) -> np.ndarray:
-    """An image uint8 [h, w, 3] below a white line of text that is made to fit its width."""
-    line = np.full((LABEL_PX, image.shape[1], 3), 255, np.uint8)
-    width = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0]
-    scale = 0.6 * min(1.0, (image.shape[1] - 8) / width)
-    cv2.putText(line, text, (4, LABEL_PX - 9), cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.concatenate([line, image])
 
 
 def read_picture(path: Path) -> np.ndarray:
@@ -52,7 +43,7 @@ def run(job: step.Job) -> None:
         ours = [read_picture(folder / f"{number:05d}.png") for folder in folders]
         titles = [f"{config.driving}, frame {number}", *(f"{name} (ours)" for name in config.variants)]
         titles += [f"{name} (published)" for name in published]
-        rows.append(strip([labelled(*pair) for pair in zip([driving, *ours, *others], titles, strict=True)]))
+        rows.append(strip([captioned(*pair) for pair in zip([driving, *ours, *others], titles, strict=True)]))
     text = PngInfo()
     text.add_text("Comment", " ".join(dict.fromkeys(synthetic_comment(path) for path in avatars)))
     Image.fromarray(np.concatenate(rows)).save(job.output.picture, format="PNG", pnginfo=text)

@@ -1,4 +1,4 @@
-"""Step: one table of a comparison: our avatars, trivial predictors and published renders on the same frames.
+"""Step `published_table`: one table of a comparison: our avatars, trivial predictors and published renders on the same frames.
 
 Input: metrics (every method's metrics.json) and per_frames (their CSVs, from which all means are taken), in one order.
 Output: csv, markdown, latex. Best in bold, second underlined, over all methods, published ones too.

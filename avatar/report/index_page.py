@@ -135,7 +135,7 @@ def notes(rows: list[dict[str, Any]]) -> list[str]:
 def counted(found: Iterable[dict[str, Any]]) -> str:
     """How many subjects there are, and what became of them."""
     found = list(found)
-    kinds = {"ok": "with scores", "rejected": "rejected", "failed": "failed"}
+    kinds = {"ok": "with scores", "rejected": "rejected", "failed": "failed", "not made": "not made yet"}
     counts = {words: sum(card["status"] == kind for card in found) for kind, words in kinds.items()}
     noun = "subject" if len(found) == 1 else "subjects"
     return f"{len(found)} {noun}: " + ", ".join(f"{count} {words}" for words, count in counts.items() if count)

@@ -121,8 +121,9 @@ def _scored(metrics: dict[str, dict], frames: int) -> dict[str, Any]:
     left_out = (
         f"Rendered frames left out: {lost['count']}, {lost['reason']}." if lost["count"] else "No rendered frame is left out."
     )
+    noun = "test frame" if first["test_frames"] == 1 else "test frames"
     return {
-        "summary": f"{frames} frames at {resolution} px, {first['test_frames']} test frames rendered",
+        "summary": f"{frames} frames at {resolution} px, {first['test_frames']} {noun} rendered",
         "tiles": page_scores.tiles(metrics),
         "tables": page_scores.tables(metrics),
         "excluded": left_out,

@@ -25,12 +25,13 @@ def ordered(metrics: dict[str, dict]) -> list[str]:
 
 
 def cells(metrics: dict[str, dict], names: list[str], key: str, digits: int, end: Any, lost: str) -> list[dict[str, Any]]:
-    """A column's cells, one a variant; the best figure as shown is marked, `lost` stands where there is none."""
+    """A column's cells, one a variant; the best of several figures, as shown, is marked, `lost` stands where there is none."""
     values = [metrics[name]["metrics"].get(key) for name in names]
     texts = [f"{value['mean']:.{digits}f}" if value else lost for value in values]
-    best = end((text for text, value in zip(texts, values, strict=True) if value), key=float, default=None)
+    known = [text for text, value in zip(texts, values, strict=True) if value]
+    best = end(known, key=float) if len(known) > 1 else None
     return [
-        {"value": text, "spread": f"{value['std']:.{digits}f}" if value else "", "best": text == best and len(names) > 1}
+        {"value": text, "spread": f"{value['std']:.{digits}f}" if value else "", "best": text == best}
         for text, value in zip(texts, values, strict=True)
     ]
 

@@ -17,7 +17,7 @@ HEAD = """<!doctype html>
 TABLES = """
 {% for table in tables %}<p class="soft{% if not loop.first %} after{% endif %}">{% if loop.first %}Mean over the scored test frames, standard deviation over frames in small figures; the best of each column is bold with a star.{% else %}The same frames, inside {{ table.name }} only.{% endif %}</p>
 <div class="scroll" tabindex="0" role="region" aria-label="Scores of {{ table.name }}"><table{% if not loop.first %} class="parts"{% endif %}>
-<thead><tr><th scope="col" rowspan="2" class="low">variant</th>{% for group in table.groups %}<th scope="colgroup" class="group{% if not loop.first %} start{% endif %}" colspan="{{ group.titles | length }}">{{ group.title }}</th>{% endfor %}</tr>
+<thead><tr><th scope="col" rowspan="2">variant</th>{% for group in table.groups %}<th scope="colgroup" class="group{% if not loop.first %} start{% endif %}" colspan="{{ group.titles | length }}">{{ group.title }}</th>{% endfor %}</tr>
 <tr>{% for group in table.groups %}{% set first = loop.first %}{% for title in group.titles %}<th scope="col"{% if loop.first and not first %} class="start"{% endif %}>{{ title }}</th>{% endfor %}{% endfor %}</tr></thead>
 <tbody>
 {% for row in table.rows %}<tr><th scope="row">{{ row.variant }}{% if row.predictor %}<span class="tag">predictor</span>{% endif %}</th>

@@ -75,9 +75,9 @@ def _rows(
         cells = []
         for name in columns:
             if name != MEAN:
-                cells.append(_cell(block.cells[name, variant], by_name[name], notes))
+                cells.append(_cell(block.cells[name, variant], by_name[name], variant, notes))
             elif block.mean_of > 1:
-                cells.append(_cell(block.cells[MEAN, variant], None, notes))
+                cells.append(_cell(block.cells[MEAN, variant], None, variant, notes))
             else:
                 cells.append(notes.mark("none", "Fewer than two subjects have these scores of every variant."))
         rows.append([title, *cells])
@@ -92,15 +92,15 @@ def _names(subjects: Sequence[Subject], variants: Sequence[str]) -> list[str]:
     return [latex.escape(name) + signs[name in predictors] + daggers[name in published] for name in variants]
 
 
-def _cell(cell: Cell, subject: Subject | None, notes: Notes) -> str:
+def _cell(cell: Cell, subject: Subject | None, variant: str, notes: Notes) -> str:
     """Figures, or a word with the number of the note that says why there are none."""
     if not cell.reason:
         text = " / ".join(latex.marked(*part) for part in cell.parts)
         return notes.mark(text, f"On {cell.remark}.") if cell.remark else text
     if subject is None or cell.reason in (tables.NOT_MEASURED, tables.NO_FACE):
         return latex.escape(cell.reason)
-    word = "rejected" if subject.status == "rejected" else "failed"
-    return notes.mark(word, cell.reason)
+    word = subject.fate(variant)
+    return word if cell.reason == tables.NOT_MADE else notes.mark(word, cell.reason)
 
 
 def _costs(
@@ -117,7 +117,7 @@ def _costs(
                 words = " / ".join(tables.cost(by_name[name], variant))
                 cells.append(latex.escape(words.replace(" ms /", " /").removesuffix(" s")))  # the title has the units
             else:
-                cells.append(_cell(Cell(reason=by_name[name].missing(variant)), by_name[name], notes))
+                cells.append(_cell(Cell(reason=by_name[name].missing(variant)), by_name[name], variant, notes))
         rows.append([title, *cells])
     return Group("Render time a frame (ms) / training time (s)", rows)
 

@@ -51,7 +51,7 @@ def titles(subjects: Sequence[Subject], variants: Sequence[str]) -> list[str]:
 def markdown(blocks: Sequence[Block], subjects: Sequence[Subject], variants: Sequence[str], cost: bool) -> str:
     """One table a block, subjects x variants; then the cost in the same layout where asked for, failures, protocol.
 
-    A subject without any figure has its reason in the first cell and a dash that refers to it in the others.
+    A subject without any figure has its reason in the first cell and `see left` in the others.
     """
     lines = []
     for place, block in enumerate(blocks):
@@ -114,9 +114,8 @@ def long_rows(subjects: Sequence[Subject], variants: Sequence[str]) -> list[dict
         for variant in variants if subject.results else [""]:
             scores = subject.results.get(variant)
             if scores is None:
-                status = "failed" if subject.status == "ok" else subject.status
                 why = subject.reason or subject.missing(variant)
-                rows.append({"subject": subject.name, "variant": variant, "status": status, "note": why})
+                rows.append({"subject": subject.name, "variant": variant, "status": subject.fate(variant), "note": why})
                 continue
             row: dict[str, Any] = {"subject": subject.name, "variant": variant, "status": "ok"}
             row |= {"predictor": scores.predictor, "published": scores.published}

@@ -1,6 +1,6 @@
 """Scores of all subjects and variants as numbers: aggregates over frames and subjects, what is best, why a cell has no figure.
 
-Pure: tables in, tables out; `avatar.report.table_text` and `avatar.report.latex` write them.
+Pure: tables in, tables out; `avatar.report.table_text` and `avatar.report.table_latex` write them.
 """
 
 from __future__ import annotations
@@ -80,24 +80,35 @@ class Scores:
         return len(self.frames) + self.excluded
 
 
+NOT_MADE = "not made yet"
+"""Where there are neither scores nor the log of a step that stopped."""
+UNSCORED = ("rejected", "failed", "not made")
+
+
 @dataclass
 class Subject:
     """What is known of a subject."""
 
     name: str
     status: str
-    """`ok`, `rejected` or `failed`."""
+    """`ok`, `rejected`, `failed` or `not made`."""
     reason: str = ""
     """Why there is no figure, where there is none."""
     results: dict[str, Scores] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
-    """Why a variant has no figures, by its name, where that is known."""
+    """Why a variant has no figures, by its name; under an empty name why none that is missing has any."""
 
     def missing(self, variant: str) -> str:
         """What stands in the cell of a variant without figures."""
         if self.reason:
             return f"rejected: {self.reason}" if self.status == "rejected" else self.reason
-        return self.reasons.get(variant, f"failed: see logs/{self.name}/{variant}/")
+        return self.reasons.get(variant) or self.reasons.get("") or NOT_MADE
+
+    def fate(self, variant: str) -> str:
+        """In a word what became of a variant without figures."""
+        if self.status in ("ok", "failed"):
+            return "not made" if self.missing(variant) == NOT_MADE else "failed"
+        return self.status
 
 
 @dataclass(frozen=True)
@@ -235,7 +246,7 @@ def remarks(subjects: Sequence[Subject], variants: Sequence[str]) -> list[str]:
     lacking = [
         f"{subject.name}/{name}" for subject in subjects if subject.results for name in variants if name not in subject.results
     ]
-    kinds = [(f"subject {kind}", [item.name for item in subjects if item.status == kind]) for kind in ("rejected", "failed")]
+    kinds = [(f"subject {kind}", [item.name for item in subjects if item.status == kind]) for kind in UNSCORED]
     kinds.append(("variant without scores", lacking))
     said = [f"{_count(len(names), what)} ({', '.join(names)})" for what, names in kinds if names]
     found = [f"Failures: {'; '.join(said) or 'none'}, of {_count(len(subjects), 'subject')}."]

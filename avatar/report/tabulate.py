@@ -126,14 +126,14 @@ def collect(job: step.Job) -> tuple[list[Subject], pd.DataFrame]:
     subjects = []
     for name in dict.fromkeys([*job.config.subjects, *facts, *results]):
         found = results.get(name, {})
-        own = {variant: reason for (subject, variant), reason in reasons.items() if subject == name and variant}
+        own = {variant: reason for (subject, variant), reason in reasons.items() if subject == name}
         if name in facts and not facts[name]["accepted"]:
             subjects.append(Subject(name, "rejected", facts[name]["reason"]))
         elif found:
             subjects.append(Subject(name, "ok", "", found, own))
         else:
-            why = reasons.get((name, "")) or next(iter(own.values()), f"failed: see logs/{name}/")
-            subjects.append(Subject(name, "failed", why))
+            why = own.get("") or next(iter(own.values()), "")
+            subjects.append(Subject(name, "failed", why) if why else Subject(name, "not made", tables.NOT_MADE))
     return subjects, _joined(frames)
 
 

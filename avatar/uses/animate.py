@@ -43,7 +43,7 @@ def run(job: step.Job) -> None:
     def shown() -> Iterator[np.ndarray]:
         """Frames for the video; what the report counts is kept without the pictures."""
         for picture in room.render(job, scene, range(len(moved)), camera.size):
-            pictures.append(picture._replace(image=np.empty((*camera.size, 0)), depth_m=None, points_m=None))
+            pictures.append(picture._replace(image=np.empty((*camera.size, 0)), depth_m=None))
             yield picture.image[..., :3]
 
     count = write_video(job.output.video, shown(), config.fps, room.comment)

@@ -21,6 +21,8 @@ INNER_LIPS = (13, 14)
 CALM_GAZE_QUANTILE = 0.75
 WIDE_QUANTILE, OPEN_OF_WIDE = 0.9, 0.8
 """Eyes count as open from this part of the gap that their widest tenth has."""
+SHOWN_FPS = 15.0
+"""Frames a second, about, of a stretch that is shown."""
 
 
 @dataclass(frozen=True)

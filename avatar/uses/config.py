@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from fitting.config import StepConfig
+from fitting.config import FitConfig, StepConfig
 
 
 class FlickerConfig(StepConfig):
@@ -23,7 +23,7 @@ class FlickerConfig(StepConfig):
 
 
 class UseConfig(StepConfig):
-    """What orbit, extrapolate, sheet and animate have in common."""
+    """What orbit, extrapolate, sheet, animate and drive have in common."""
 
     sample_factor: float | None = Field(
         None, ge=0.25, le=16, description="Samples on a ray, as in `render`; null takes the variant's own `render.sample_factor`."
@@ -58,7 +58,7 @@ class SheetConfig(UseConfig):
 
 
 class AnimateConfig(UseConfig):
-    """animate: a file of expressions and poses drives the avatar. One entry a file, by a name of your own."""
+    """animate: a file of expressions and poses drives every avatar. One entry a file."""
 
     file: str = Field(description="CSV or NPZ of named columns, one row a frame (see README); a fit/track.npz will do.")
     fps: float = Field(30.0, gt=0, le=240, description="Frames a second of the video, and of a file without `time_s`.")
@@ -71,7 +71,7 @@ class HalfDataConfig(StepConfig):
 
 
 class DriverConfig(StepConfig):
-    """drivers: one driving video, whose motion moves the avatars of a subject; it is tracked and never trains."""
+    """drivers: a video whose motion moves the avatars of a subject; it is tracked and never trains. One entry a video."""
 
     video: str = Field(description="The driving video's file.")
     subject: str = Field(description="Subject whose avatars it drives: the same person, filmed at another time or place.")
@@ -89,7 +89,9 @@ class DriveConfig(UseConfig):
 
     size: int = Field(256, ge=16, le=2048, description="Longer side of each picture in pixels; never larger than the frames.")
     max_frames: int | None = Field(
-        20, ge=1, description="At most this many frames, evenly spaced over the driving video and shown at its speed; null: all."
+        20,
+        ge=1,
+        description="Frames, about 15 a second, where the driver's face moves most; null: all of the driving video.",
     )
     view_degrees: float = Field(25.0, ge=0, le=90, description="How far the moving viewpoint swings to either side.")
     identity_limit: float | None = Field(
@@ -116,6 +118,7 @@ class IdentityPartsConfig(StepConfig):
     """identity_parts: identity from disjoint parts of one clip. No part of `config.yaml`, as the next."""
 
     parts: int = Field(3, ge=2, le=20, description="Consecutive parts into which the clip is cut.")
+    fit: FitConfig = Field(FitConfig(), description="The config's own `fit`, as drivers and subjects are fitted with it.")
 
 
 class IdentityCalibrationConfig(StepConfig):

@@ -1,4 +1,4 @@
-"""drive: an avatar moved by another video of the same person.
+"""Step `drive`: an avatar moved by another video of the same person.
 
 Input: head, avatar, track, split, index (the subject's), driver_track, driver_frames, driver_index. Output: video, report, strip.
 The video shows, side by side, the driver as filmed, the avatar through the subject's own camera, and the avatar from a viewpoint
@@ -7,6 +7,7 @@ that swings around it, with its depth. What is carried over, and how, stands in 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 
 from avatar.frames import chosen_frames
-from avatar.uses import identity, motion, retarget, sequence
+from avatar.uses import choose, identity, motion, retarget, sequence
 from avatar.uses.config import DriveStepConfig
 from avatar.uses.drive_picture import rows_of
 from avatar.uses.studio import Studio, open_studio
@@ -68,6 +69,9 @@ def check_identity(job: step.Job, head: HeadModel, driver: Fit, subject: Fit) ->
         raise step.StepError(f"{job.input.driver_track}: {sentence}; {way}")
     if found.word != "same":
         job.log.warning("%s", sentence)
+    if job.config.identity_limit is None and head.name != identity.CALIBRATED_ON:
+        how = "set drive.identity_limit, as `snakemake identity_calibration` finds it"
+        job.log.warning("the limit is that of head model %s, not of %s: %s", identity.CALIBRATED_ON, head.name, how)
     return {
         "verdict": found.word,
         "distance": round(found.distance, 4),
@@ -87,15 +91,29 @@ def driven(
     same: whether both are one person.
     """
     good = np.flatnonzero(driver.usable).tolist()
-    chosen = chosen_frames(good, config.max_frames)
+    chosen, stride = stretch_of(head, driver, good, config.max_frames)
     source = retarget.rest_of(head, driver.shape, driver.motion.take(good))
     target = retarget.rest_of(head, subject.shape, subject.motion.take(train))
     moved = motion.smoothed(driver.motion, config.smooth_s)
-    moved = moved.take(chosen, moved.fps * len(chosen) / len(good))  # frames left out must not speed it up
+    moved = moved.take(chosen, moved.fps / stride)
     centres = retarget.face_centres(head, driver.shape, moved)
     offset = retarget.same_face(head, driver.shape, subject.shape) if same else None
     carried = retarget.transferred(head, subject.shape, moved, source, target, centres, config.use, offset)
     return carried, chosen, (source, [good[k] for k in source.frames]), (target, [train[k] for k in target.frames])
+
+
+def stretch_of(head: HeadModel, driver: Fit, good: list[int], most: int | None) -> tuple[list[int], int]:
+    """The driver's frames to show and the distance between them: all usable ones, or where the face moves most.
+
+    good: usable frames; most: how many, None for all.
+    """
+    if most is None:
+        return good, 1
+    stride = max(1, round(driver.motion.fps / choose.SHOWN_FPS))
+    moved = driver.motion.take(good)
+    camera = sequence.Camera(1.0, np.zeros(2), (1, 1))  # no picture is taken: looks are measured on the mesh
+    looks = choose.looks_of(sequence.scene_of(head, driver.shape, camera, moved), moved.eyes)
+    return [good[place] for place in choose.liveliest(looks, good, most, stride)], stride
 
 
 def swing(count: int, degrees: float) -> np.ndarray:
@@ -119,9 +137,17 @@ def run(job: step.Job) -> None:
     ahead, aside = pictures(studio, moved, yaw, job)
     frames = np.load(job.input.driver_frames, mmap_mode="r")
     rows = rows_of([frames[frame] for frame in chosen], ahead, aside, np.degrees(yaw), job.config.use)
-    write_video(job.output.video, rows, moved.fps, studio.comment)
-    shown = chosen_frames(list(range(len(rows))), STRIP_ROWS)
-    cv2.imwrite(str(job.output.strip), np.concatenate([rows[place] for place in shown])[..., ::-1])
+    strip, on_strip = [], chosen_frames(chosen, STRIP_ROWS)
+
+    def shown() -> Iterator[np.ndarray]:
+        """Rows for the video; those of the strip are kept."""
+        for frame, row in zip(chosen, rows, strict=True):
+            if frame in on_strip:
+                strip.append(row)
+            yield row
+
+    write_video(job.output.video, shown(), moved.fps, studio.comment)
+    cv2.imwrite(str(job.output.strip), np.concatenate(strip)[..., ::-1])
     job.write_json(
         job.output.report,
         {

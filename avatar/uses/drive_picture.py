@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -25,14 +25,13 @@ def fitted(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def rows_of(
     driver: Sequence[np.ndarray], ahead: Sequence[Picture], aside: Sequence[Picture], yaw_degrees: np.ndarray, use: str
-) -> list[np.ndarray]:
+) -> Iterator[np.ndarray]:
     """One row of four captioned panels a frame, uint8 [h, w, 3] all of one size; depth on one scale over all of them.
 
     driver: frames uint8 [., ., 3] as filmed; yaw_degrees: [T] of the moving viewpoint; use: what is taken from the driver.
     """
     near, far = shading.depth_range([seen.depth_m for seen in aside], [seen.image[..., 3] for seen in aside])
     named = "driver, as filmed" if use == "both" else f"driver ({use} taken)"
-    rows = []
     for frame, front, side, angle in zip(driver, ahead, aside, yaw_degrees.tolist(), strict=True):
         panels = (
             (named, fitted(frame, front.image.shape[:2])),
@@ -40,5 +39,4 @@ def rows_of(
             (f"avatar, {round(angle):+d} deg", side.image[..., :3]),
             (f"depth {100 * near:.0f} to {100 * far:.0f} cm", shading.depth_picture(side.depth_m, side.image[..., 3], near, far)),
         )
-        rows.append(shading.grid([[shading.captioned(picture, name) for name, picture in panels]], 4))
-    return rows
+        yield shading.grid([[shading.captioned(picture, name) for name, picture in panels]], 4)

@@ -1,4 +1,4 @@
-"""drive_split: training and test frames of a driving video, of which nothing is tested.
+"""Step `drive_split`: training and test frames of a driving video, of which nothing is tested.
 
 Input: landmarks. Output: split (json). The fit solves identity and focal length on training frames and wants a test part; a
 driving video gives it all but a short tail.

@@ -21,7 +21,6 @@ FACTORS = (1.0, 1.5, 2.0)
 ROWS = 4
 """Frames on the sheet."""
 APART_S = 0.5
-SHOWN_FPS = 15.0
 MARGIN = 0.12
 """Of the head's box in the input, around it: a chin drops further with doubled codes."""
 
@@ -33,7 +32,7 @@ def run(job: step.Job) -> None:
     test = room.test_frames()
     moved = room.motion(test)
     looks = choose.looks_of(room.scene(moved), moved.eyes)
-    stride = max(1, round(room.fps / SHOWN_FPS))
+    stride = max(1, round(room.fps / choose.SHOWN_FPS))
     stretch = choose.liveliest(looks, test, config.frames, stride)
     strongest = choose.most_expressive(looks, ROWS, max(1, round(APART_S * room.fps)))
     wanted = sorted({*stretch, *strongest})

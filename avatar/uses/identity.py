@@ -16,6 +16,7 @@ import numpy as np
 from fitting.head_model import REGIONS, HeadModel
 
 # `snakemake identity_calibration` on the shared clips and the default head; see README, "drive".
+CALIBRATED_ON = "anny"
 CHOSEN = "codes"
 REFUSED_FROM = 0.31
 DOUBT = 0.8  # of the limit: pairs from there on are warned of, for parts of one clip are nearer than two sessions

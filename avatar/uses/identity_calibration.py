@@ -1,4 +1,4 @@
-"""identity_calibration: how far fitted heads lie apart, of one person and of two, and the limit that tells them apart best.
+"""Step `identity_calibration`: how far fitted heads lie apart, of one person and of two, and the limit between them.
 
 Input: head, rows (of `identity_parts`, one a clip). Output: report (json), markdown, plot (svg). Each clip counts as a person of
 its own; parts of one clip share light, lens and day, so what is said of one person is optimistic.

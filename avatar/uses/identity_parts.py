@@ -1,7 +1,7 @@
-"""identity_parts: identity of one clip from disjoint parts of it, to learn how far one person is from himself.
+"""Step `identity_parts`: identity of one clip from disjoint parts of it, to learn how far one person is from himself.
 
-Input: head, frames, index, landmarks, alpha. Output: row (json). Parts are neighbouring stretches of one recording, under one
-light and one lens: two recordings of one person lie further apart, so what is learned from parts is optimistic.
+Input: head, frames, index, landmarks, alpha, split. Output: row (json). Parts are neighbouring stretches of one recording, under
+one light and one lens: two recordings of one person lie further apart, so what is learned from parts is optimistic.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 from avatar.uses.config import IdentityPartsConfig
 from avatar.uses.drive_split import driver_split
 from fitting import tracking
-from fitting.config import FitConfig
 from fitting.files import load_head
 from fitting.fit import read_clip
 from workflow import step
@@ -44,8 +43,8 @@ def part_of(clip: tracking.Clip, rows: np.ndarray) -> tracking.Clip:
 def run(job: step.Job) -> None:
     """Fit every part on its own; a part that cannot be fitted is left out, with its reason."""
     head = load_head(job.input.head)
-    config = FitConfig()
-    clip = read_clip(step_job(job, config), head)
+    config = job.config.fit
+    clip = read_clip(replace(job, config=config), head)  # as the step `fit` reads it
     parts, left_out = [], []
     for rows in job.progress(np.array_split(np.arange(len(clip.frames)), job.config.parts), "parts"):
         span = [int(rows[0]), int(rows[-1])]
@@ -59,11 +58,6 @@ def run(job: step.Job) -> None:
         parts.append({"frames": span, "usable": usable, "focal_px": state.focal_px, "shape": state.shape.tolist()})
     job.write_json(job.output.row, {"subject": job.subject, "head_digest": head.digest, "parts": parts, "left_out": left_out})
     job.log.info("%d of %d parts of %s fitted", len(parts), job.config.parts, job.subject)
-
-
-def step_job(job: step.Job, config: FitConfig) -> step.Job:
-    """The job as the step `fit` would see it."""
-    return replace(job, config=config)
 
 
 if __name__ == "__main__":

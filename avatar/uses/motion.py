@@ -7,7 +7,7 @@ Rotations are averaged as matrices, never as axis-angle vectors, which jump by a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -102,16 +102,3 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 def held(motion: Motion, place: int, count: int) -> Motion:
     """Frame `place` held for `count` frames."""
     return motion.take([place] * count)
-
-
-def combined(pose: Motion, expression: Motion) -> Motion:
-    """Head pose (rotation, neck, translation) of one motion with expression, jaw and gaze of another of equal length."""
-    if len(pose) != len(expression):
-        raise ValueError(f"two motions of {len(pose)} and {len(expression)} frames cannot be put together")
-    return replace(expression, rotation=pose.rotation, neck=pose.neck, translation=pose.translation)
-
-
-def joined(motions: Sequence[Motion]) -> Motion:
-    """Motions one after the other, at the frame rate of the first."""
-    parts = {item.name: np.concatenate([getattr(motion, item.name) for motion in motions]) for item in fields(Motion)[:-1]}
-    return Motion(**parts, fps=motions[0].fps)

@@ -19,6 +19,7 @@ import csv
 import difflib
 import re
 import sys
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +31,8 @@ from fitting.camera import exp_rotation, log_rotation
 from fitting.head_model import HeadModel
 
 TIME = "time_s"
+LONGEST_STEP_S = 5.0
+"""Median step between rows from which times are taken for milliseconds: 16 or 33 of them lie between frames."""
 VECTORS = {"rotation": (), "neck": (), "jaw": (), "eye_left": (0,), "eye_right": (1,), "translation": ()}
 """Column stems, and where each lies in its part of the motion."""
 ARKIT_ONLY = re.compile(r"(eyelook(in|out|up|down)(left|right)|tongueout|_neutral)$")
@@ -65,7 +68,7 @@ def read(path: Path, head: HeadModel, rest: Motion, fps: float) -> Parameters:
     """
     try:
         columns = _csv(path) if path.suffix.lower() != ".npz" else _npz(path)
-    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+    except (OSError, EOFError, csv.Error, zipfile.BadZipFile, ValueError) as error:
         if isinstance(error, ParameterError | FileNotFoundError):
             raise
         raise ParameterError(f"not readable as {'NPZ' if path.suffix.lower() == '.npz' else 'CSV'} ({error})") from error
@@ -96,7 +99,11 @@ def _csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def _npz(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
+    """Arrays by name."""
+    found = np.load(path, allow_pickle=False)
+    if isinstance(found, np.ndarray):
+        raise ParameterError("one array without a name; write it with numpy.savez and name the columns")
+    with found as file:
         columns = {name: file[name] for name in file.files}
     _refuse_twins(list(columns))
     return columns
@@ -167,11 +174,13 @@ def _motion(values: dict[str, np.ndarray], names: Sequence[str], rest: Motion, f
 def resampled(motion: Motion, time_s: np.ndarray) -> Motion:
     """A motion given at times [T] s, at its own frame rate from the first time to the last; linear between rows.
 
-    Raises ParameterError naming the row whose time does not grow.
+    Raises ParameterError naming the row whose time does not grow, or for times that can be no seconds.
     """
     still = np.flatnonzero(np.diff(time_s) <= 0)
     if len(still):
         raise ParameterError(f"row {still[0] + 2} of column {TIME} is {time_s[still[0] + 1]:g}, not after the row before it")
+    if len(time_s) > 1 and (step_s := float(np.median(np.diff(time_s)))) > LONGEST_STEP_S:
+        raise ParameterError(f"rows of column {TIME} are {step_s:g} s apart; if these are milliseconds, divide them by 1000")
     wanted = np.arange(int(np.floor((time_s[-1] - time_s[0]) * motion.fps + 1e-6)) + 1) / motion.fps + time_s[0]
     before = np.clip(np.searchsorted(time_s, wanted, side="right") - 1, 0, max(len(time_s) - 2, 0))
     after = np.minimum(before + 1, len(time_s) - 1)

@@ -30,6 +30,7 @@ FEWEST = 5
 FLOOR = 0.05
 DOUBT_M2 = 1e-6  # of `same_face`: squared displacement per vertex and unit of code below which a code is left alone
 STEEPEST = 2.0  # how much a code may be stretched on its way: noise is stretched with it
+BLOCK = 1000  # frames compared with all others at once
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,9 @@ def rest_of(head: HeadModel, shape: np.ndarray, motion: Motion) -> Rest:
 def _most_usual(rotation: np.ndarray) -> int:
     """The frame whose turn [T, 3] is nearest to all others' in the sum."""
     matrices = exp_rotation(rotation).reshape(len(rotation), 9)
-    cosine = np.clip((matrices @ matrices.T - 1) / 2, -1, 1)
-    return int(np.arccos(cosine).sum(1).argmin())
+    blocks = (matrices[start : start + BLOCK] for start in range(0, len(matrices), BLOCK))
+    angles = [np.arccos(np.clip((block @ matrices.T - 1) / 2, -1, 1)).sum(1) for block in blocks]
+    return int(np.concatenate(angles).argmin())
 
 
 def carried(codes: np.ndarray, source: np.ndarray, target: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -194,5 +196,5 @@ def bridged(motion: Motion, usable: Sequence[bool] | np.ndarray) -> Motion:
     good = np.flatnonzero(usable)
     if not len(good):
         raise ValueError("none of the frames is usable")
-    nearest = good[np.abs(np.arange(len(motion))[:, None] - good).argmin(1)]
+    nearest = good[np.searchsorted((good[1:] + good[:-1]) / 2, np.arange(len(motion)))]  # of two equally near ones the earlier
     return motion.take(nearest.tolist())

@@ -48,7 +48,6 @@ class Picture(NamedTuple):
 
     image: np.ndarray  # [H, W, 4] uint8, RGB on white and opacity
     depth_m: np.ndarray  # [H, W] float32 along the camera's axis; 0 where the opacity is 0
-    points_m: np.ndarray  # [H, W, 3] float32 where the rays end, in camera axes
     milliseconds: float  # all work of this frame but the head model's posing, which `scene_of` does for all frames at once
     evaluations: int  # of the field
 
@@ -136,9 +135,9 @@ def render(
         raise ValueError(f"the render of frame {frame} is not finite; train the avatar again")
     image = (colour * 255 + 0.5).byte().numpy().reshape(*size, 4)
     place, along = scene.place[frame], rendered.depth.numpy()[:, None] * (image[..., 3].reshape(-1, 1) > 0)
-    points = (rays.origins_m + along * rays.directions) @ scene.rotation[place].T + scene.offset_m[place]
-    points = np.where(along > 0, points, 0).astype(np.float32).reshape(*size, 3)
-    return Picture(image, points[..., 2], points, 1000 * (time.perf_counter() - started), evaluations)
+    ends = (rays.origins_m + along * rays.directions) @ scene.rotation[place, 2] + scene.offset_m[place, 2]
+    depth = np.where(along[:, 0] > 0, ends, 0).astype(np.float32).reshape(size)
+    return Picture(image, depth, 1000 * (time.perf_counter() - started), evaluations)
 
 
 def render_all(

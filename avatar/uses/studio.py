@@ -42,9 +42,9 @@ class Studio:
     sample_factor: float
     track_path: Path
 
-    def motion(self, frames: Sequence[int], fps: float | None = None) -> Motion:
+    def motion(self, frames: Sequence[int]) -> Motion:
         """The clip's own motion in some frames."""
-        return of_track(self.track, frames, fps or self.fps)
+        return of_track(self.track, frames, self.fps)
 
     def scene(self, motion: Motion, camera: Camera | None = None) -> Scene:
         """This head in a motion; StepError names the track or motion that does not fit."""

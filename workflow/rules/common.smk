@@ -5,6 +5,7 @@ import atexit
 import hashlib
 import json
 import shlex
+import subprocess
 import sys
 from functools import cache
 from pathlib import Path
@@ -225,11 +226,11 @@ def of_subject(pattern, variants):
     return expand(pattern, variant=variants, allow_missing=True)
 
 
-def tabulate_existing(wildcards, threads):
-    """As `step`, for tables of what exists now; where scores are missing, the log of the step that did not finish."""
+def available(wildcards=None):
+    """Command for the tables and the index page of what exists now; where scores are missing, the log of what did not finish."""
     existing = lambda paths: [path for path in paths if Path(path).exists()]  # noqa: E731
     of_all = {"subject": SUBJECTS, "variant": ALL_VARIANTS}
-    input = {
+    found = {
         "probes": existing(expand("results/{subject}/probe/probe.json", subject=SUBJECTS)),
         "per_frames": existing(expand("results/{subject}/{variant}/metrics/per_frame.csv", **of_all)),
         "metrics": existing(expand("results/{subject}/{variant}/metrics/metrics.json", **of_all)),
@@ -238,8 +239,27 @@ def tabulate_existing(wildcards, threads):
     names = {"csv": "available.csv", "per_frame": "available_per_frame.csv"}
     for prefix, name in {"": "available", "regions_": "available_regions"}.items():
         names |= {f"{prefix}markdown": f"{name}.md", f"{prefix}latex": f"{name}.tex"}
-    output = {name: f"results/tables/{file}" for name, file in names.items()}
-    return step("avatar.report.tabulate", subject="all")({}, input, output, threads)
+    tables = {name: f"results/tables/{file}" for name, file in names.items()}
+    pages = {
+        "table": tables["csv"],
+        "pages": existing(expand("results/{subject}/page", subject=SUBJECTS)),
+        "plots": existing(["results/plots/speed.svg"]),
+    }
+    tabulate = step("avatar.report.tabulate", subject="all")({}, found, tables, 1)
+    tabulate = f"{tabulate} --config {shlex.quote(table_config(None))} --code {digest_of('avatar.report.tabulate')}"
+    index = step("avatar.report.index_page", subject="all")({}, pages, {"page": "results/available"}, 1)
+    index = f"{index} --code {digest_of('avatar.report.index_page')}"
+    return f"mkdir -p logs && {{ {tabulate} && {index} ; }} > logs/available.log 2>&1"
+
+
+def make_available():
+    """After a run in which something failed: tables and index page, each failure with its reason, as `snakemake available`."""
+    if any(Path(f"results/{subject}/probe/probe.json").exists() for subject in SUBJECTS):
+        made = subprocess.run(available(), shell=True, check=False).returncode == 0
+        where = (
+            "results/tables/available.md, results/available/index.html" if made else "failed, see logs/available.log"
+        )
+        atexit.register(lambda: print(f"what exists: {where}", file=sys.stderr))
 
 
 def summarise_at_exit():

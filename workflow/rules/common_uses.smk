@@ -104,7 +104,7 @@ def uses_files(kind):
             files += [f"animate/{name}/animate.{kind}" for name in SETTINGS.animate]
         own = [name for name, driver in SETTINGS.drivers.items() if driver.subject == wildcards.subject]
         last = "strip.png" if kind == "png" else f"drive.{kind}"
-        files += [f"drive/{name}/{last}" for name in own if accepted(DRIVER + name)]
+        files += [f"drive/{name}/{last}" for name in own if may_move(name, DRIVER + name, "its video")]
         return [f"results/{wildcards.subject}/{wildcards.variant}/{file}" for file in files]
 
     return paths
@@ -134,6 +134,15 @@ def _left_out(name, reason):
     atexit.register(lambda: print(f"driver {name}: left out, {reason}", file=sys.stderr))
 
 
+def may_move(name, who, what):
+    """Whether probe accepts one of the two videos of a driver; where not, the last lines of the run say why."""
+    if accepted(who):
+        return True
+    probe = json.loads(Path(f"results/{who}/probe/probe.json").read_text(encoding="utf-8"))
+    _left_out(name, f"{what} is rejected: {probe['reason']}")
+    return False
+
+
 def drive_of(name):
     """What `drive` wants of a driver: a video an avatar, or, where probe rejects one of the two videos, the reason alone."""
     if name is None:
@@ -142,10 +151,8 @@ def drive_of(name):
         )
     subject = SETTINGS.drivers[name].subject
     for who, what in ((DRIVER + name, "its video"), (subject, f"the video of {subject}")):
-        if not accepted(who):
-            path = f"results/{who}/probe/probe.json"
-            _left_out(name, f"{what} is rejected: {json.loads(Path(path).read_text(encoding='utf-8'))['reason']}")
-            return path
+        if not may_move(name, who, what):
+            return f"results/{who}/probe/probe.json"
     pattern = "results/{subject}/{variant}/drive/{driver}/drive.json"
     return expand(pattern, subject=subject, variant=VARIANTS, driver=name)
 

@@ -16,11 +16,10 @@ rule drive_split:
     wildcard_constraints:
         subject=re.escape(DRIVER) + ".*",
     params:
-        config="{}",
         code=code_of("avatar.uses.drive_split"),
         run=step("avatar.uses.drive_split"),
     shell:
-        "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"
+        "{params.run} --code {params.code} > {log:q} 2>&1"
 
 
 rule drive_avatar:
@@ -60,6 +59,12 @@ rule drive_avatar:
 rule drive:
     input:
         [lambda wildcards, name=name: drive_of(name) for name in SETTINGS.drivers or [None]],
+        # As for `uses`: two probes are asked for one after the other.
+        probes=[
+            f"results/{who}/probe/probe.json"
+            for name, driver in SETTINGS.drivers.items()
+            for who in (DRIVER + name, driver.subject)
+        ],
 
 
 # How far fitted heads of one person and of two lie apart, from the videos of the folder: `snakemake identity_calibration`.
@@ -78,7 +83,7 @@ rule identity_parts:
     benchmark:
         "benchmarks/identity/{subject}.tsv"
     params:
-        config="{}",
+        config=lambda wildcards: json.dumps({"fit": SETTINGS.fit.model_dump(mode="json")}),
         code=code_of("avatar.uses.identity_parts"),
         run=step("avatar.uses.identity_parts"),
     shell:
@@ -96,8 +101,7 @@ rule identity_calibration:
     log:
         "logs/identity/calibration.log",
     params:
-        config="{}",
         code=code_of("avatar.uses.identity_calibration"),
         run=step("avatar.uses.identity_calibration", subject="all"),
     shell:
-        "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"
+        "{params.run} --code {params.code} > {log:q} 2>&1"

@@ -186,6 +186,8 @@ rule uses:
             lambda wildcards, subject=subject: of_uses(subject, "results/{subject}/{variant}/uses")
             for subject in SUBJECTS
         ],
+        # Pages ask for the drivers' probes: what a plan does not hold from the start, Snakemake resolves at the top only.
+        probes=expand("results/{who}/probe/probe.json", who=[*SUBJECTS, *(DRIVER + name for name in SETTINGS.drivers)]),
 
 
 # The paper's test of how an avatar bears less data: the same training on the first half of its frames, in {variant}.half. The
