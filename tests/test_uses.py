@@ -11,9 +11,9 @@ import pytest
 from toy_head import toy_head
 from toy_run import job, train_in, write_subject
 
-from avatar import baseline, half_data, provenance, render
+from avatar import baseline, provenance, render
 from avatar.config import BaselineConfig, RenderConfig
-from avatar.uses import animate, choose, extrapolate, motion, orbit, parameters, sheet
+from avatar.uses import animate, choose, extrapolate, half_data, motion, orbit, parameters, sheet
 from avatar.uses.config import AnimateConfig, ExtrapolateConfig, HalfDataConfig, OrbitConfig, SheetConfig
 from fitting.video import read_frames
 from workflow.step import StepError

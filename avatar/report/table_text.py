@@ -89,7 +89,7 @@ def _scores(block: Block, subjects: Sequence[Subject], variants: Sequence[str]) 
 
 def _text(cell: Cell) -> str:
     if cell.reason:
-        return cell.reason
+        return cell.reason.replace("<", "&lt;")  # a quoted log may hold what Markdown takes for HTML
     return " / ".join(marked(*part) for part in cell.parts) + (f" ({cell.remark})" if cell.remark else "")
 
 

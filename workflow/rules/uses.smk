@@ -200,8 +200,8 @@ rule split_half:
     log:
         "logs/{subject}/split_half.log",
     params:
-        code=code_of("avatar.half_data"),
-        run=step("avatar.half_data"),
+        code=code_of("avatar.uses.half_data"),
+        run=step("avatar.uses.half_data"),
     shell:
         "{params.run} --code {params.code} > {log:q} 2>&1"
 
