@@ -60,7 +60,7 @@ def test_table(scored: tuple[list[Path], list[Path]], tmp_path: Path) -> None:
     text = outputs["markdown"].read_text()
     row = next(line for line in text.splitlines() if line.startswith("| Shifted"))
     assert row.count("**") == 2 * 12 and f"| {len(SCORED)} of 4 |" in row  # best in head, face, mouth and eyes
-    assert text.count("<u>") == 2 * 12  # two methods of the same pixels share the second place
+    assert text.count("<ins>") == 2 * 12  # two methods of the same pixels share the second place
     assert "my_demo: 10 minutes of training" in text and "clothes and shoulders" in text
     latex = outputs["latex"].read_text()
     assert r"my\_demo" in latex and r"\textbf{" in latex and r"\underline{" in latex and r"\midrule" in latex

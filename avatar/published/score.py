@@ -40,7 +40,7 @@ def protocol(size: tuple[int, int], config: PublishedScoreConfig, frames: str) -
         "reaches over the outline",
         "resolution": f"{size[1]}x{size[0]}, the panel's own pixels; published renders carry the comparison video's compression",
         "frames": frames,
-        "stride": f"every {config.stride}. test frame" if config.stride > 1 else "every test frame",
+        "stride": f"one test frame in {config.stride}" if config.stride > 1 else "every test frame",
     }
 
 

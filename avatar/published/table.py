@@ -14,7 +14,7 @@ from typing import Any
 import pandas as pd
 
 from avatar.published.config import PublishedTableConfig
-from avatar.report import latex, tables
+from avatar.report import latex, table_text, tables
 from avatar.report.results import many
 from workflow import step
 
@@ -25,7 +25,6 @@ TRAINED = {
 }
 """By kind, in the order of the table. The frames that test are the same for all."""
 REGIONS = ("head", *tables.REGIONS)
-MARKS = {tables.BEST: "**{}**", tables.SECOND: "<u>{}</u>"}
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ def markdown(methods: Sequence[Method]) -> str:
     title = " / ".join(metric.title for metric in tables.SHOWN)
     lines = [["method", *REGIONS, "frames", "trained"], ["---"] * (len(REGIONS) + 3)]
     for place, method in enumerate(methods):
-        texts = [" / ".join(MARKS.get(rank, "{}").format(text) for text, rank in column[place]) for column in columns]
+        texts = [" / ".join(table_text.marked(text, rank) for text, rank in column[place]) for column in columns]
         lines.append([method.name, *texts, method.counted, method.trained])
     table = ["| " + " | ".join(line) + " |" for line in lines]
     top = (
