@@ -249,13 +249,13 @@ def available(wildcards=None):
     tabulate = f"{tabulate} --config {shlex.quote(table_config(None))} --code {digest_of('avatar.report.tabulate')}"
     index = step("avatar.report.index_page", subject="all")({}, pages, {"page": "results/available"}, 1)
     index = f"{index} --code {digest_of('avatar.report.index_page')}"
-    return f"mkdir -p logs && {{ {tabulate} && {index} ; }} > logs/available.log 2>&1"
+    return f"{{ {tabulate} && {index} ; }}"
 
 
 def make_available():
     """After a run in which something failed: tables and index page, each failure with its reason, as `snakemake available`."""
     if any(Path(f"results/{subject}/probe/probe.json").exists() for subject in SUBJECTS):
-        made = subprocess.run(available(), shell=True, check=False).returncode == 0
+        made = subprocess.run(f"{available()} > logs/available.log 2>&1", shell=True, check=False).returncode == 0
         where = (
             "results/tables/available.md, results/available/index.html" if made else "failed, see logs/available.log"
         )

@@ -136,7 +136,9 @@ rule tabulate:
 # `snakemake available`: the tables and the index page of what exists now, whatever failed. It asks for nothing, so it makes nothing
 # else run. A run in which something failed ends with it.
 rule available:
+    log:
+        "logs/available.log",
     params:
         run=available,
     shell:
-        "{params.run} && cat results/tables/available.md"
+        "{params.run} > {log:q} 2>&1 && cat results/tables/available.md"
