@@ -78,8 +78,7 @@ def pipeline(finished: Path, tmp_path: Path) -> Pipeline:
 
 def add_field(pipeline: Pipeline, model: str) -> None:
     """A new key with a default in a step's config."""
-    files = [path for part in ("fitting", "avatar") for path in (pipeline.folder / part).rglob("config.py")]
-    path = next(path for path in files if f"class {model}(" in path.read_text())
+    path = next(path for path in pipeline.folder.glob("*/**/config.py") if f"class {model}(" in path.read_text())
     name, text = str(path.relative_to(pipeline.folder)), path.read_text()
     start = re.search(rf"^class {model}\(StepConfig\):\n(    \"\"\".*?\"\"\"\n)", text, re.M | re.S)
     pipeline.edit(name, start[0], start[0] + "    spare: int = 1\n")
