@@ -171,7 +171,7 @@ def content_of_parameter_file(wildcards):
 def animations_of(subject):
     """What `animate` wants of a subject."""
     if not SETTINGS.animate:
-        how = "for example animate: {wave: {file: wave.csv}}; README, 'A parameter file', says what the file holds"
+        how = "for example animate: {wave: {file: wave.csv}}; README, 'Uses', says what the file holds"
         raise WorkflowError(f"animate: name a parameter file in {CONFIG}, {how}")
     return of_uses(subject, "results/{subject}/{variant}/animate/{name}/animate.json", name=SETTINGS.animate)
 
