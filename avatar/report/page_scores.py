@@ -67,7 +67,8 @@ def _cost(result: dict[str, Any]) -> list[str]:
     """Render time, training time and number of frames of a variant."""
     seconds = result.get("training_seconds")
     training = f"{seconds:.0f}" if seconds is not None else "not trained" if result["predictor"] else "not given"
-    return [f"{result['ms_per_frame']:.1f}", training, str(result["scored_frames"])]
+    speed = result.get("ms_per_frame")
+    return ["not known" if speed is None else f"{speed:.1f}", training, str(result["scored_frames"])]
 
 
 def tables(metrics: dict[str, dict]) -> list[dict[str, Any]]:
@@ -98,7 +99,8 @@ def tiles(metrics: dict[str, dict]) -> list[dict[str, str]]:
         for key, title, digits, end in COLUMNS
         if key in ("lpips", "ssim", "psnr")
     ]
-    found.append({"value": f"{best['ms_per_frame']:.0f} ms", "label": "render time a frame"})
+    if best.get("ms_per_frame") is not None:
+        found.append({"value": f"{best['ms_per_frame']:.0f} ms", "label": "render time a frame"})
     if best.get("training_seconds") is not None:
         found.append({"value": f"{best['training_seconds'] / 60:.1f} min", "label": "training time"})
     return [*found, {"value": str(best["scored_frames"]), "label": "test frames scored"}]

@@ -62,14 +62,12 @@ def of_track(track: Mapping[str, np.ndarray], frames: Sequence[int], fps: float)
     return Motion(**{name: np.asarray(track[name])[list(frames)].astype(np.float64) for name in PARTS}, fps=fps)
 
 
-def scaled(motion: Motion, factor: float, neutral: np.ndarray | None = None) -> Motion:
+def scaled(motion: Motion, factor: float) -> Motion:
     """Expression codes and jaw times `factor` (paper, section 4.5: twice the code of a test frame).
 
-    neutral: [E] code that stays where it is; None is zero. No code is clipped: going beyond what was seen is the point.
+    The zero code stays where it is, and none is clipped: going beyond what was seen is the point.
     """
-    rest = np.zeros(motion.expression.shape[1]) if neutral is None else neutral
-    codes = rest + factor * (motion.expression - rest)
-    return replace(motion, expression=codes, jaw=motion.jaw * factor)  # `factor` times the angle
+    return replace(motion, expression=motion.expression * factor, jaw=motion.jaw * factor)  # `factor` times the angle
 
 
 def smoothed(motion: Motion, seconds: float) -> Motion:
