@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from avatar.config import TrainConfig
+from avatar.config import TrainConfig, modules_of
 from fitting.head_model import HeadModel
 
 # Fields of TrainConfig that the network and its sampling are made of; the rest only concerns training.
@@ -48,7 +48,7 @@ def build(settings: dict[str, Any], head: HeadModel) -> nn.Module:
 
     The module is named as a string and imported here, so that one representation's code is not part of another's digest.
     """
-    return import_module(f"avatar.features.{settings['representation']}").create(settings, head)
+    return import_module(modules_of(settings["representation"])[0]).create(settings, head)
 
 
 def content(avatar: nn.Module, settings: dict[str, Any], head: HeadModel, **more: Any) -> dict[str, Any]:

@@ -13,6 +13,12 @@ from pydantic import Field, field_validator
 from fitting.config import StepConfig
 
 
+def modules_of(representation: str, training: bool = False) -> tuple[str, ...]:
+    """Dotted names of the modules that make an avatar of a representation and, with `training`, of the one that trains it."""
+    made = f"avatar.features.{representation}"
+    return (made, f"avatar.learning.{'images' if representation == 'layers' else 'rays'}") if training else (made,)
+
+
 class TrainConfig(StepConfig):
     """train: fit the avatar to the training frames."""
 

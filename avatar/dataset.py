@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from avatar.features import Condition
+from avatar.view import View
 from avatar.volume import Rays
 from fitting.head_model import HeadModel
 
@@ -67,6 +68,11 @@ class Scene:
         condition = Condition(self.displacement_m[places].to(device), self.codes[places].to(device), neutral, time)
         return self.vertices_m[places].to(device), condition
 
+    def view(self, frame: int, size: tuple[int, int]) -> View:
+        """The camera of a frame for a picture of `size` (H, W)."""
+        place = self.place[frame]
+        return View(self.focal_px, self.centre_px, self.rotation[place], self.offset_m[place], size)
+
     def camera_centre_m(self, frame: int) -> np.ndarray:
         """Camera centre [3] in the head frame."""
         place = self.place[frame]
@@ -74,17 +80,11 @@ class Scene:
 
     def rays(self, frame: int, columns: np.ndarray, rows: np.ndarray) -> Rays:
         """Rays through pixel centres; columns, rows: [N] integers."""
-        pixels = np.stack([columns, rows], -1) + 0.5 - self.centre_px
-        directions = np.concatenate([pixels / self.focal_px, np.ones((len(pixels), 1))], -1) @ self.rotation[self.place[frame]]
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        origins = np.broadcast_to(self.camera_centre_m(frame), directions.shape)
-        return Rays(origins.astype(np.float32), directions.astype(np.float32))
+        return self.view(frame, (0, 0)).through(columns, rows)
 
     def pixels_of(self, frame: int, points_m: np.ndarray) -> np.ndarray:
         """Projections [N, 2] (column, row; pixel centres at +0.5) of head-frame points [N, 3]."""
-        place = self.place[frame]
-        camera = points_m @ self.rotation[place].T + self.offset_m[place]
-        return camera[:, :2] / camera[:, 2:] * self.focal_px + self.centre_px
+        return self.view(frame, (0, 0)).pixels_of(points_m)[:, :2]
 
 
 def on_white(frame: np.ndarray, alpha: np.ndarray) -> np.ndarray:

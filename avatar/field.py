@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from avatar.layers import MLP, encoded_size, linear_in, positional_encoding
+from avatar.networks import MLP, encoded_size, linear_in, positional_encoding
 
 HEAD_SIZE_M = 0.15  # offsets are divided by it before encoding
 NEAREST_M = 1e-8  # distances below the rounding of coordinates in metres count as this

@@ -1,7 +1,8 @@
 """The radiance-field avatar: a source of vertex features, the k-NN field and volume rendering.
 
-What a representation offers (the same for every one): `pose` a head once a frame, then `render` rays of posed heads with
-gradients and with its own loss terms, or `march` the rays of one without. All in the neck-normalised head frame.
+What a representation offers (the same for every one): `pose` a head once a frame, then draw a `picture` of it without
+gradients; what trains it is in `avatar.learning`. Here also `render`, rays of posed heads with gradients and with loss terms of
+their own, and `march`, the rays of one without. All in the neck-normalised head frame.
 
 Two ways to sample: `shell` (ours: one network, stratified samples in a shell around the posed mesh) and `hierarchical` (the
 paper's: a coarse network at uniform samples, a fine one where the first saw something).
@@ -22,6 +23,7 @@ from avatar.features import Condition, Features
 from avatar.field import Field
 from avatar.neighbours import keep_mates, nearest_by_blocks, nearest_by_tree, resting_and_shut, surface_mates, tree_of
 from avatar.sampling import Packed
+from avatar.view import View
 from avatar.volume import CLOSED, Rays, Rendered, composite
 from avatar.warp import WarpField, elastic, magnitude
 from fitting.head_model import HeadModel
@@ -203,6 +205,10 @@ class RadianceAvatar(nn.Module):
     def march(self, posed: Posed, rays: Rays, precision: torch.dtype) -> tuple[Rendered, int]:
         """Render the first posed head without gradients: N rays and the number of field evaluations."""
         return marching.march(self, posed, rays, precision)
+
+    def picture(self, posed: Posed, view: View, precision: torch.dtype) -> tuple[Rendered, int]:
+        """All pixels of a view of the first posed head, row by row, without gradients, and the number of field evaluations."""
+        return self.march(posed, view.rays(), precision)
 
     def nearest(self, posed: Posed, head: int, points_m: np.ndarray) -> np.ndarray:
         """Vertices [P, K] that the field reads at points [P, 3] of one posed head, nearest first."""

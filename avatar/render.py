@@ -12,7 +12,7 @@ from avatar import build
 from avatar.config import RenderConfig
 from avatar.dataset import Scene, on_white
 from avatar.frames import chosen_frames
-from avatar.layers import best_precision
+from avatar.networks import best_precision
 from avatar.provenance import synthetic_comment
 from fitting.files import load_head
 from fitting.video import write_video
@@ -52,8 +52,7 @@ def render_frame(
 ) -> tuple[np.ndarray, int]:
     """One image [H, W, 4] uint8 (RGB on white, A opacity) and the number of field evaluations."""
     posed = avatar.pose(*scene.heads([frame], device))
-    rows, columns = np.mgrid[: size[0], : size[1]]
-    rendered, evaluations = avatar.march(posed, scene.rays(frame, columns.ravel(), rows.ravel()), precision)
+    rendered, evaluations = avatar.picture(posed, scene.view(frame, size), precision)
     image = torch.cat([rendered.colour, rendered.opacity[:, None]], 1).clamp(0, 1)
     if not torch.isfinite(image).all():
         raise step.StepError(f"the render of frame {frame} is not finite; train the avatar again")

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from avatar.field import HEAD_SIZE_M
-from avatar.layers import encoded_size
+from avatar.networks import encoded_size
 
 JOIN_AT = 4  # the trunk's input joins again before this layer
 LATENT_BOUND, OUTPUT_BOUND = 0.05, 1e-4  # uniform from 0 (Nerfies): the warp starts near the identity

@@ -23,6 +23,7 @@ from avatar.ablation import truth as ablation_truth
 from avatar.ablation.config import AblationConfig, AblationDataConfig
 from avatar.config import TrainConfig
 from avatar.dataset import Scene
+from avatar.learning import rays
 from fitting import simulate, synthetic
 from fitting.config import SimulateConfig
 from fitting.head_model import HeadModel
@@ -52,7 +53,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(autouse=True)
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Full precision, and the mean absolute error in the place of LPIPS, whose weights are a download."""
-    monkeypatch.setattr(train, "best_precision", lambda device: torch.float32)
+    monkeypatch.setattr(rays, "best_precision", lambda device: torch.float32)
     monkeypatch.setattr(ablation, "best_precision", lambda device: torch.float32)
     monkeypatch.setattr(ablation.lpips, "load", lambda path, device: lambda a, b: (a - b).abs().mean((1, 2, 3)))
 

@@ -13,7 +13,7 @@ from avatar import build
 from avatar.config import TrainConfig
 from avatar.describe import Row, counted, describe, layers_of, main, scaled
 from avatar.field import Field
-from avatar.layers import UNET_LEVELS
+from avatar.networks import UNET_LEVELS
 
 HEAD = toy_head()
 SOURCES = ("ours_d", "ours_c", "codes_mlp", "codes", "static", "displacement_mlp")

@@ -21,9 +21,9 @@ FILES = {
     "avatar/build.py": "import importlib\ndef build(name):\n    return importlib.import_module('avatar.features.' + name)\n",
     "avatar/train.py": "def run():\n    from .build import build\n    return build('ours_d')\n",
     "avatar/features/__init__.py": "",
-    "avatar/features/ours_d.py": "from ..layers import conv\n",
+    "avatar/features/ours_d.py": "from ..networks import conv\n",
     "avatar/features/ours_c.py": "x = 1\n",
-    "avatar/layers.py": "import fitting.camera\nconv = 1\n",
+    "avatar/networks.py": "import fitting.camera\nconv = 1\n",
 }
 
 
@@ -54,7 +54,7 @@ def test_extra_module_brings_what_it_imports(code: Path) -> None:
     plain = digest.closure("avatar.train", root=code)
     whole = digest.closure("avatar.train", ("avatar.features.ours_d",), root=code)
     assert set(whole) - set(plain) == {
-        "avatar.features", "avatar.features.ours_d", "avatar.layers", "fitting", "fitting.camera",
+        "avatar.features", "avatar.features.ours_d", "avatar.networks", "fitting", "fitting.camera",
     }  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def test_another_representation_does_not_count(code: Path) -> None:
     before = digest.code_digest("avatar.train", ("avatar.features.ours_d",), root=code)
     write(code, "avatar/features/ours_c.py", "x = 2\n")
     assert digest.code_digest("avatar.train", ("avatar.features.ours_d",), root=code) == before
-    write(code, "avatar/layers.py", "conv = 2\n")
+    write(code, "avatar/networks.py", "conv = 2\n")
     assert digest.code_digest("avatar.train", ("avatar.features.ours_d",), root=code) != before
 
 

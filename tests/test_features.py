@@ -17,7 +17,7 @@ from avatar.features import codes_mlp as vae
 from avatar.features.ours_c import doublings
 from avatar.features.shared import DISPLACEMENT_UNIT_M, FEATURE_SCALE, POSITION_BANDS, STATIC_GAIN, VertexMLP
 from avatar.field import HEAD_SIZE_M
-from avatar.layers import positional_encoding
+from avatar.networks import positional_encoding
 
 SOURCES = ("ours_d", "ours_c", "codes_mlp", "codes", "static", "displacement_mlp")
 READ_CODES = ("ours_c", "codes_mlp", "codes")

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from avatar.field import DENSITY_LENGTH_M, HEAD_SIZE_M, Field, inverse_distance_weights
-from avatar.layers import positional_encoding
 from avatar.neighbours import nearest_by_blocks, nearest_by_tree, tree_of
+from avatar.networks import positional_encoding
 
 
 def small_field() -> Field:

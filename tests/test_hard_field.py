@@ -14,7 +14,7 @@ from toy_head import RADII_M, toy_head
 
 from avatar import shell
 from avatar.field import HEAD_SIZE_M, NEAREST_M, Field, inverse_distance_weights
-from avatar.layers import positional_encoding
+from avatar.networks import positional_encoding
 from avatar.uv import UVMap, rasterise
 from fitting.raster import vertex_normals
 

@@ -11,8 +11,9 @@ import torch
 from toy_head import toy_head, toy_images, toy_track
 from toy_run import train_in, write_subject
 
-from avatar import build, render, train
+from avatar import build, learning, render
 from avatar.dataset import Scene, on_white
+from avatar.learning import rays
 from workflow.step import StepError
 
 TINY = {
@@ -35,7 +36,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(autouse=True)
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train, "best_precision", lambda device: torch.float32)
+    monkeypatch.setattr(rays, "best_precision", lambda device: torch.float32)
 
 
 def curve_of(outputs: dict[str, Path]) -> np.ndarray:
@@ -78,19 +79,19 @@ def test_exposure_drift_costs_no_more_than_itself(inputs: dict[str, Path], tmp_p
 
 def test_a_tiny_model_far_past_convergence_stays_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """1500 steps, over ten times the other runs here, at a rate that only halves: nothing skipped, and what was learned stays."""
-    subject, posed, known = write_subject(tmp_path, 6, 32), train.Batches.posed, {}
+    subject, posed, known = write_subject(tmp_path, 6, 32), rays.Batches.posed, {}
 
-    def kept(self: train.Batches, frames: list[int], *more: object, **named: object) -> object:
+    def kept(self: rays.Batches, frames: list[int], *more: object, **named: object) -> object:
         """The heads of a step, posed once: they are the same four in every step."""
         key = (*frames, *more, *named.items())
         if key not in known:
             known[key] = posed(self, frames, *more, **named)
         return known[key]
 
-    monkeypatch.setattr(train.Batches, "posed", kept)
-    monkeypatch.setattr(train, "PROBE_STRIDE", 1)  # every 4th of 32 pixels would be a figure of 64 pixels
+    monkeypatch.setattr(rays.Batches, "posed", kept)
+    monkeypatch.setattr(learning, "PROBE_STRIDE", 1)  # every 4th of 32 pixels would be a figure of 64 pixels
     monkeypatch.setattr(
-        train.losses, "learning_rate", lambda start, step, steps: start * min(1, (step + 1) / 30) * 0.5 ** (step / steps)
+        rays.losses, "learning_rate", lambda start, step, steps: start * min(1, (step + 1) / 30) * 0.5 ** (step / steps)
     )
     tiny = {
         "mlp_width": 16,

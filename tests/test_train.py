@@ -13,6 +13,7 @@ import torch
 from toy_run import train_in, write_subject
 
 from avatar import train
+from avatar.learning import rays
 from workflow.step import StepError
 
 
@@ -23,7 +24,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(autouse=True)
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train, "best_precision", lambda device: torch.float32)
+    monkeypatch.setattr(rays, "best_precision", lambda device: torch.float32)
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
@@ -105,30 +106,30 @@ def test_a_changed_run_never_continues_from_stale_weights(
 def test_bad_steps_are_skipped_counted_and_stop_the_run(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original, calls = train.losses.photometric, []
+    original, calls = rays.losses.photometric, []
 
     def one_bad(*arguments: object) -> torch.Tensor:
         calls.append(1)
         return original(*arguments) * (float("nan") if len(calls) == 2 else 1.0)
 
-    monkeypatch.setattr(train.losses, "photometric", one_bad)
+    monkeypatch.setattr(rays.losses, "photometric", one_bad)
     outputs = train_in(tmp_path / "one", inputs, steps=4)
     assert json.loads(outputs["report"].read_text())["skipped_steps"] == 1
     assert all(torch.isfinite(value).all() for value in weights(outputs["avatar"]).values())
-    monkeypatch.setattr(train.losses, "photometric", lambda *arguments: original(*arguments) * float("inf"))
+    monkeypatch.setattr(rays.losses, "photometric", lambda *arguments: original(*arguments) * float("inf"))
     with pytest.raises(StepError, match=r"diverges at step 3: 3 of the last 3 steps .* on frames \["):
         train_in(tmp_path / "all", inputs, steps=6)
 
 
 def test_a_network_that_died_stops_the_run(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = train.make_avatar
+    original = rays.make_avatar
 
     def dead(*arguments: object) -> torch.nn.Module:
         avatar = original(*arguments)
         torch.nn.init.constant_(avatar.field.mlp1.layers[-1].bias, -1e6)
         return avatar
 
-    monkeypatch.setattr(train, "make_avatar", dead)
+    monkeypatch.setattr(rays, "make_avatar", dead)
     with pytest.raises(StepError, match="the network is dead"):
         train_in(tmp_path, inputs, steps=6)
 
@@ -173,14 +174,14 @@ def test_a_forward_pass_that_is_not_finite_names_its_frames(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """NaN weights of the coarse network place the fine samples, a NaN latent moves the points: no tree is asked for those."""
-    original = train.make_avatar
+    original = rays.make_avatar
 
     def poisoned(*arguments: object) -> torch.nn.Module:
         avatar = original(*arguments)
         torch.nn.init.constant_(avatar.coarse.density.bias if what == "coarse" else avatar.warp.latents, float("nan"))
         return avatar
 
-    monkeypatch.setattr(train, "make_avatar", poisoned)
+    monkeypatch.setattr(rays, "make_avatar", poisoned)
     keys = {"coarse": {"sampling": "hierarchical", "coarse_samples": 6, "fine_samples": 6}, "warp": {"warp": True}}[what]
     with pytest.raises(train.TrainingFailed, match=r"not finite, the last on frames \["):
         train_in(tmp_path, inputs, steps=6, **keys)

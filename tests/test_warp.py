@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from avatar.field import HEAD_SIZE_M
-from avatar.layers import positional_encoding
+from avatar.networks import positional_encoding
 from avatar.warp import WarpField, elastic, magnitude, rigid, windowed_encoding
 
 HEADS = ("rotation", "centre", "translation")

@@ -21,7 +21,7 @@ import numpy as np
 from avatar import evaluate, lpips, render, train
 from avatar.ablation.config import AblationConfig
 from avatar.config import RenderConfig
-from avatar.layers import best_precision
+from avatar.networks import best_precision
 from avatar.report import pictures
 from fitting.files import load_head
 from fitting.synthetic_motion import exaggerated

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from avatar.features import Condition, Features
 from avatar.features.shared import POSITION_SIZE, VertexMLP, add_table, code_count, encoded_position, new_table
-from avatar.layers import encoded_size, positional_encoding
+from avatar.networks import encoded_size, positional_encoding
 from avatar.radiance import RadianceAvatar
 from fitting.head_model import HeadModel
 

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from avatar.features import Condition, Features
 from avatar.features.shared import add_table, code_count, new_table
-from avatar.layers import SLOPE, UNET_LEVELS, decode, enlarging_blocks
+from avatar.networks import SLOPE, UNET_LEVELS, decode, enlarging_blocks
 from avatar.radiance import RadianceAvatar
 from avatar.uv import UVMap
 from fitting.head_model import HeadModel

@@ -6,7 +6,7 @@ from torch import nn
 
 from avatar.features import Condition, Features
 from avatar.features.shared import DISPLACEMENT_UNIT_M, add_table, new_table
-from avatar.layers import UNet
+from avatar.networks import UNet
 from avatar.radiance import RadianceAvatar
 from avatar.uv import UVMap
 from fitting.head_model import HeadModel

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from avatar.field import HEAD_SIZE_M
-from avatar.layers import MLP, encoded_size, positional_encoding
+from avatar.networks import MLP, encoded_size, positional_encoding
 from fitting.head_model import HeadModel
 
 DISPLACEMENT_UNIT_M = 0.01  # expressions move the skin by millimetres: inputs of about one

@@ -12,7 +12,7 @@ import numpy as np
 
 from avatar import provenance, render
 from avatar.dataset import Scene
-from avatar.layers import best_precision
+from avatar.networks import best_precision
 from avatar.published.config import PublishedRenderConfig
 from avatar.published.protocol import Grid, write_pictures
 from workflow import step

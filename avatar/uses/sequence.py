@@ -127,15 +127,14 @@ def render(
     Raises ValueError naming the frame where the render is not finite.
     """
     started = time.perf_counter()
-    rows, columns = np.mgrid[: size[0], : size[1]]
-    rays = scene.rays(frame, columns.ravel(), rows.ravel())
-    rendered, evaluations = avatar.march(avatar.pose(*scene.heads([frame], device)), rays, precision)
+    view = scene.view(frame, size)
+    rendered, evaluations = avatar.picture(avatar.pose(*scene.heads([frame], device)), view, precision)
     colour = torch.cat([rendered.colour, rendered.opacity[:, None]], 1).clamp(0, 1)
     if not (torch.isfinite(colour).all() and torch.isfinite(rendered.depth).all()):
         raise ValueError(f"the render of frame {frame} is not finite; train the avatar again")
     image = (colour * 255 + 0.5).byte().numpy().reshape(*size, 4)
-    place, along = scene.place[frame], rendered.depth.numpy()[:, None] * (image[..., 3].reshape(-1, 1) > 0)
-    ends = (rays.origins_m + along * rays.directions) @ scene.rotation[place, 2] + scene.offset_m[place, 2]
+    rays, along = view.rays(), rendered.depth.numpy()[:, None] * (image[..., 3].reshape(-1, 1) > 0)
+    ends = (rays.origins_m + along * rays.directions) @ view.rotation[2] + view.offset_m[2]
     depth = np.where(along[:, 0] > 0, ends, 0).astype(np.float32).reshape(size)
     return Picture(image, depth, 1000 * (time.perf_counter() - started), evaluations)
 

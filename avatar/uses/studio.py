@@ -12,7 +12,7 @@ import torch
 from avatar import build, provenance
 from avatar.config import RenderConfig
 from avatar.dataset import Scene
-from avatar.layers import best_precision
+from avatar.networks import best_precision
 from avatar.uses import sequence
 from avatar.uses.motion import Motion, of_track
 from avatar.uses.sequence import Camera, Picture

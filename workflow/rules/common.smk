@@ -10,7 +10,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-from avatar.config import RenderConfig, TrainConfig
+from avatar.config import RenderConfig, TrainConfig, modules_of
 from avatar.settings import Settings
 from fitting import benchmark_settings
 from fitting.assets import ASSETS
@@ -123,11 +123,11 @@ def code_of(command, extra=()):
 
 
 def model_code_of(command):
-    """As `code_of`, with the module of the variant's representation, which is imported by name."""
+    """As `code_of`, with the modules of the variant's representation, which are imported by name."""
 
     def code(wildcards):
         representation = TRAINED[wildcards.variant]["train"].representation
-        return digest_of(command, (f"avatar.features.{representation}",))
+        return digest_of(command, modules_of(representation, training=command == "avatar.train"))
 
     return code
 

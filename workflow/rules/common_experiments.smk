@@ -69,7 +69,7 @@ def ablation_config(wildcards):
 def ablation_code(wildcards):
     """As `model_code_of`, for the cell's representation."""
     representation = ablation_settings.CELLS[wildcards.cell].representation
-    return digest_of("avatar.ablation.cell", (f"avatar.features.{representation}",))
+    return digest_of("avatar.ablation.cell", modules_of(representation, training=True))
 
 
 def ablation_rows(wildcards):

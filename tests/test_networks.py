@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from avatar.layers import (
+from avatar.networks import (
     MLP,
     SLOPE,
     ResidualBlock,
