@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,7 +43,7 @@ FIELD_BLOCKS = {
     "mlp2": "colour MLP",
     "colour": "colour MLP",
 }
-BLOCKS = ("source", *dict.fromkeys(FIELD_BLOCKS.values()), "warp")
+BLOCKS = ("source", *dict.fromkeys(FIELD_BLOCKS.values()), "warp", "textures")
 
 
 class Row(NamedTuple):
@@ -76,10 +76,10 @@ class LayerCounter(TorchDispatchMode):
         return result
 
 
-def counted(module: nn.Module, *arguments: Any) -> dict[str, int]:
-    """FLOP of one call of a module by the name of its parameters, without gradients."""
+def counted(module: nn.Module, *arguments: Any, call: Callable[..., Any] | None = None) -> dict[str, int]:
+    """FLOP of one call of a module, or of a method of its, by the name of its parameters, without gradients."""
     with torch.no_grad(), LayerCounter(module) as counter:
-        module(*arguments)
+        (call or module)(*arguments)
     return counter.flop
 
 
@@ -123,7 +123,8 @@ def field_rows(field: Field) -> list[Row]:
     weight, width = field.from_feature.weight, field.from_feature.out_features
     points, vertices = weight.new_zeros(ROWS, 3), weight.new_zeros(field.neighbours, 3)  # the field pads fewer
     index = torch.arange(field.neighbours, device=weight.device).expand(ROWS, -1)
-    total = counted(field, points, points, vertices, index, weight.new_zeros(field.neighbours, width), weight.dtype)
+    terms = weight.new_zeros(field.neighbours, width)
+    total = counted(field, points, points, vertices, index, terms, weight.dtype, call=field.plainly)
     flop = {name: value // ROWS for name, value in total.items()}
     flop["from_feature.weight"] = 2 * field.neighbours * weight.numel()
     rows = [row._replace(block=FIELD_BLOCKS[row.name.split(".")[0]]) for row in rows_of(field, "", flop, flop, "sample")]
@@ -138,8 +139,23 @@ def warp_rows(warp: nn.Module) -> list[Row]:
     return list(rows_of(warp, "warp", counted(warp, weight.new_zeros(1, 3), frame, float(warp.bands)), {}, "sample"))
 
 
+def layered_rows(avatar: nn.Module) -> list[Row]:
+    """The network of a layered avatar for one frame, and its textures, which are looked up and not multiplied."""
+    weight = avatar.out.weight
+    told = weight.new_zeros(1, next(avatar.unet.parameters()).shape[1], *avatar.skin_corners.shape[:2])
+    network = nn.Sequential(avatar.unet, avatar.out)
+    flop = counted(network, told)
+    rows = rows_of(network, "source", flop, flop, "frame")
+    names = {"0": "unet", "1": "out"}
+    rows = [row._replace(name=".".join([names[row.name.split(".")[0]], *row.name.split(".")[1:]])) for row in rows]
+    shape = " x ".join(str(extent) for extent in avatar.textures.shape)
+    return [*rows, Row("textures", "", shape, avatar.textures.numel(), 0, 0, "frame")]
+
+
 def layers_of(avatar: nn.Module, head: HeadModel) -> list[Row]:
     """Every layer of an avatar, block by block; a coarse network, which equals the fine one in size, is left out."""
+    if not hasattr(avatar, "field"):
+        return layered_rows(avatar)
     warp = getattr(avatar, "warp", None)
     return source_rows(avatar.source, head) + field_rows(avatar.field) + ([] if warp is None else warp_rows(warp))
 
@@ -180,6 +196,8 @@ def describe(settings: dict[str, Any], head: HeadModel, name: str, warp_frames: 
         parameters = sum(row.parameters for row in chosen)
         lines += ["", f"{block}: {parameters:,} parameters, {scaled(test)} a {chosen[0].unit}{extra}"]
         lines += [f"  {row.name:<28}{row.shape:<34}{row.parameters:>10,}  {note_of(row)}".rstrip() for row in chosen]
+    if not hasattr(avatar, "field"):
+        return "\n".join([*lines, "", "a pixel: a texel of each layer until the light is gone"]) + "\n"
     sample = sum(row.flop_test for row in rows if row.unit == "sample")
     vertex = 2 * avatar.field.from_feature.weight.numel() * head.vertex_count
     saved = sum(row.flop_test for row in rows if row.name == "from_feature")

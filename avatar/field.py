@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from avatar import field_kernel
 from avatar.networks import MLP, encoded_size, linear_in, positional_encoding
 
 HEAD_SIZE_M = 0.15  # offsets are divided by it before encoding
@@ -43,6 +44,7 @@ class Field(nn.Module):
         super().__init__()
         self.neighbours, self.bands, self.view_bands = neighbours, bands, view_bands
         self.encoded = encoded_size(3, bands)
+        self.units = HEAD_SIZE_M, NEAREST_M
         first = nn.Linear(self.encoded + channels, width)  # split in two below: exact algebra, W [PE, z] = W_pe PE + W_z z
         nn.init.kaiming_uniform_(first.weight, nonlinearity="relu")
         self.from_offset = nn.Linear(self.encoded, width, bias=False)
@@ -75,6 +77,21 @@ class Field(nn.Module):
         Encoding, weights, heads and outputs are float32 (or the points' own type); hidden layers run in `precision`.
         Returns density [P] per metre, >= 0, and colour [P, 3] in [0, 1].
         """
+        if len(points_m) and field_kernel.fits(self, points_m, vertices_m):
+            density, colour = field_kernel.evaluate(self, points_m, directions, vertices_m, index, terms, precision)
+            return density / DENSITY_LENGTH_M, colour
+        return self.plainly(points_m, directions, vertices_m, index, terms, precision)
+
+    def plainly(
+        self,
+        points_m: Tensor,
+        directions: Tensor,
+        vertices_m: Tensor,
+        index: Tensor,
+        terms: Tensor,
+        precision: torch.dtype = torch.float32,
+    ) -> tuple[Tensor, Tensor]:
+        """`forward` layer by layer: on any device, with gradients of everything."""
         count = len(points_m)
         points_m, directions, index = (padded(rows) for rows in (points_m, directions, index))
         offsets = vertices_m[index] - points_m[:, None]  # [P, K, 3]

@@ -22,6 +22,7 @@ RATES = {"field": 1.0, "table": 1.0, "source": 0.3, "warp": 0.1}
 ELASTIC_WEIGHTS = (1e-4, 1e-5)
 ELASTIC_FALL = (55_000, 155_000)  # of PAPER_STEPS: Nerfies' 50k constant, then 100k of cosine, after the warp's delay
 MAGNITUDE_WEIGHT = 1e-2
+OUTSIDE_WEIGHT = 1e-2
 KL_WEIGHT = 1e-4  # of the conditional VAE; the paper does not say
 
 
@@ -97,8 +98,9 @@ def elastic_weight(step: int, steps: int) -> float:
 
 
 def weight_of(term: str, step: int, steps: int) -> float:
-    """Weight at a step of a loss term that a representation names: elastic, magnitude (supplement A) or kl (`codes_mlp`)."""
-    return {"elastic": elastic_weight(step, steps), "magnitude": MAGNITUDE_WEIGHT, "kl": KL_WEIGHT}[term]
+    """Weight at a step of a loss term: elastic, magnitude (supplement A), kl (`codes_mlp`) or outside (`radiance.clearing`)."""
+    constant = {"magnitude": MAGNITUDE_WEIGHT, "kl": KL_WEIGHT, "outside": OUTSIDE_WEIGHT}
+    return elastic_weight(step, steps) if term == "elastic" else constant[term]
 
 
 def psnr(rendered: Tensor, truth: Tensor) -> float:

@@ -1,7 +1,7 @@
 """Rendering without gradients: one posed head, many rays, no more work than the picture needs.
 
-In the shell half of a ray's samples are spread over it, front to back until next to no light passes; the other half goes where
-these saw something. Before that the shell loses the voxels that the field leaves empty.
+In the shell samples go where the field's density at the centres of the voxels that the picture sees says that light ends; see
+`avatar.guide`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
-from avatar import sampling, shell
+from avatar import guide, shell
 from avatar.volume import CLOSED, Rays, Rendered, composite
 
 if TYPE_CHECKING:
@@ -22,10 +21,9 @@ if TYPE_CHECKING:
 
 RAY_CHUNK = 16384
 DENSE_CHUNK = 512  # rays at a time where whole rays are sampled
-SLOT_BLOCK = 4
-FIELD_CHUNK = 4096  # samples that stay in the processor's cache
+FIELD_CHUNK = 1 << 16  # samples at a time on other devices; on a CPU the field makes its own blocks
 END = 0.004  # light behind a ray's end: one level of 8 bits
-VOID = 0.01  # optical depth across a voxel below which its surroundings are skipped
+GUIDED = 2 / 3  # of the samples that training spreads over the shell
 
 
 @torch.no_grad()
@@ -41,10 +39,10 @@ def march(avatar: RadianceAvatar, posed: Posed, rays: Rays, precision: torch.dty
     else:
         terms = avatar.field.vertex_terms(features.values, precision).flatten(0, 1)
         marcher = Marcher(avatar, posed, terms, precision)
-        grid, evaluations = marcher.pruned()
+        density, evaluations = marcher.seen(rays)
         parts = []
         for some in chunks(rays, RAY_CHUNK):
-            rendered, count = marcher.render(grid, some)
+            rendered, count = marcher.render(density, some)
             parts.append(rendered)
             evaluations += count
     return Rendered(*(torch.cat(column).cpu() for column in zip(*parts, strict=True))), evaluations
@@ -65,31 +63,16 @@ class Marcher:
     terms: Tensor  # [V, width], see `Field.vertex_terms`
     precision: torch.dtype
 
-    def render(self, grid: shell.Grid, rays: Rays) -> tuple[Rendered, int]:
-        """N rays inside the shell, and the number of field evaluations."""
-        found, count, met = shell.intervals(grid, rays.origins_m, rays.directions)
-        step, most = 2 * self.avatar.step_m, max(1, self.avatar.max_samples // 2)
-        coarse = shell.sample(found, count, step, most, None, met)
-        density, colour, evaluations = self.front_to_back(rays, coarse)
-        _, weight = composited(coarse, density, colour, len(count))
-        samples, old = sampling.refine(found, count, coarse, weight.cpu().numpy(), met)
-        new = np.flatnonzero(old < 0)
-        density, colour = density[old], colour[old]  # those of new samples come now
-        density[new], colour[new] = self.at(rays, samples, new)
-        return composited(samples, density, colour, len(count))[0], evaluations + len(new)
+    def render(self, density: np.ndarray, rays: Rays) -> tuple[Rendered, int]:
+        """N rays inside the shell, and the number of field evaluations; density: from `guide.seen_density`."""
+        samples = guide.guided(self.posed.grids[0], density, rays, self.avatar.step_m, self.most, END)
+        found = self.at(rays, samples, np.arange(len(samples.ray)))
+        return composited(samples, *found, len(rays.origins_m))[0], len(samples.ray)
 
-    def front_to_back(self, rays: Rays, samples: shell.Samples) -> tuple[Tensor, Tensor, int]:
-        """Density [P] and colour [P, 3], both 0 where less than END of the light arrives, and how many samples that left."""
-        density = torch.zeros(len(samples.ray), device=self.terms.device)
-        colour = density.new_zeros(len(samples.ray), 3)
-        depth, evaluations = np.zeros(len(rays.origins_m)), 0  # optical depth in front
-        for block in range(0, int(samples.slot.max(initial=-1)) + 1, SLOT_BLOCK):
-            within = (samples.slot >= block) & (samples.slot < block + SLOT_BLOCK)
-            chosen = np.flatnonzero(within & (np.exp(-depth[samples.ray]) > END))
-            density[chosen], colour[chosen] = self.at(rays, samples, chosen)
-            np.add.at(depth, samples.ray[chosen], density[chosen].cpu().numpy() * samples.step_m[chosen])
-            evaluations += len(chosen)
-        return density, colour, evaluations
+    @property
+    def most(self) -> int:
+        """Samples on a ray: fewer than where they are spread over the whole shell."""
+        return max(1, round(self.avatar.max_samples * GUIDED))
 
     def at(self, rays: Rays, samples: shell.Samples, chosen: np.ndarray) -> tuple[Tensor, Tensor]:
         """Density and colour at some samples of the rays."""
@@ -106,19 +89,12 @@ class Marcher:
         ]
         return torch.cat([piece[0] for piece in pieces]), torch.cat([piece[1] for piece in pieces])
 
-    def pruned(self) -> tuple[shell.Grid, int]:
-        """The head's shell without the voxels whose surroundings the field leaves empty: one evaluation a voxel.
+    def seen(self, rays: Rays) -> tuple[np.ndarray, int]:
+        """The field's density at the voxels that the rays see, and the number of field evaluations."""
+        return guide.seen_density(self.posed.grids[0], rays, self._density, END)
 
-        A voxel stays when any of its 27 neighbours, itself included, has an optical depth of VOID at its centre.
-        """
-        grid = self.posed.grids[0]
-        place = np.argwhere(grid.labels == shell.SHELL)
-        points = ((place + 0.5) * shell.VOXEL_M + grid.origin).astype(np.float32)
-        density = self.evaluate(points, np.zeros_like(points))[0]
-        full = np.zeros(grid.labels.shape, bool)
-        full[tuple(place.T)] = (density * shell.VOXEL_M > VOID).cpu().numpy()
-        keep = ndimage.binary_dilation(full, np.ones((3, 3, 3), bool)) | (grid.labels == shell.CORE)
-        return shell.Grid(grid.origin, np.where(keep, grid.labels, shell.EMPTY)), len(place)
+    def _density(self, points_m: np.ndarray) -> np.ndarray:
+        return self.evaluate(points_m, np.zeros_like(points_m))[0].cpu().numpy()  # seen along no direction: it has no part in it
 
 
 def composited(samples: shell.Samples, density: Tensor, colour: Tensor, rays: int) -> tuple[Rendered, Tensor]:

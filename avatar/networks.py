@@ -124,17 +124,32 @@ class UNet(nn.Module):
         self.down = nn.ModuleList(ResidualBlock(down[i], down[i + 1], 2) for i in range(len(levels)))
         self.up, self.merge = enlarging_blocks(levels[-1], [*reversed(levels[:-1]), 0])
         self.out = nn.Conv2d(self.up[-1].out_channels, after, 1)
+        self.precision = torch.float32  # of training's convolutions; see `train_in`
 
     def forward(self, maps: Tensor) -> Tensor:
-        """maps: [B, before, H, W] with H and W multiples of 2^levels. Returns [B, after, H, W].
+        """maps: [B, before, H, W] with H and W multiples of 2^levels. Returns [B, after, H, W] of the same type.
 
+        Without gradients always in the weights' own type.
         Raises ValueError when the size cannot be halved that often.
         """
         if maps.shape[-1] % 2**self.halvings or maps.shape[-2] % 2**self.halvings:
             raise ValueError(f"maps of {tuple(maps.shape[-2:])} texels cannot be halved {self.halvings} times")
-        skips = []
-        for block in self.down:
-            maps = block(maps)
-            skips.append(maps)
-        skips.pop()  # the bottleneck itself
-        return self.out(decode(maps, self.up, self.merge, skips))
+        lower = self.precision == torch.bfloat16 and torch.is_grad_enabled()
+        with torch.autocast(maps.device.type, torch.bfloat16, enabled=lower):
+            skips, inner = [], maps
+            for block in self.down:
+                inner = block(inner)
+                skips.append(inner)
+            skips.pop()  # the bottleneck itself
+            return self.out(decode(inner, self.up, self.merge, skips)).to(maps.dtype)
+
+
+def train_in(avatar: nn.Module, precision: torch.dtype) -> nn.Module:
+    """Let the avatar's U-Nets learn in `precision`, with channels last in memory, as these convolutions are fastest.
+
+    Forward and backward of four maps of 128 texels on one AMX core: 557 ms, channels last 482, bfloat16 285, both 179.
+    """
+    for module in avatar.modules():
+        if isinstance(module, UNet):
+            module.precision = precision
+    return avatar.to(memory_format=torch.channels_last)

@@ -21,7 +21,15 @@ from torch import Tensor, nn
 from avatar import marching, sampling, shell
 from avatar.features import Condition, Features
 from avatar.field import Field
-from avatar.neighbours import keep_mates, nearest_by_blocks, nearest_by_tree, resting_and_shut, surface_mates, tree_of
+from avatar.neighbours import (
+    keep_mates,
+    nearest_by_blocks,
+    nearest_by_tree,
+    nearest_mates,
+    resting_and_shut,
+    surface_mates,
+    tree_of,
+)
 from avatar.sampling import Packed
 from avatar.view import View
 from avatar.volume import CLOSED, Rays, Rendered, composite
@@ -31,6 +39,7 @@ from fitting.head_model import HeadModel
 # Density's start on whole rays: softplus(CLEAR) / 3 mm over 0.6 m of air is an optical depth of 0.2. From a fog (0, -3 and -5
 # were tried, toy subject) the first thing learned is to clear it everywhere, and the network dies of it.
 CLEAR = -7.0
+CLEAR_DENSITY = 0.02  # per metre: what is farther away than the shell may have it, half a metre of it lets 99 % of the light pass
 CANDIDATES = 3  # times the neighbours: as many nearest vertices are looked at for mates
 
 
@@ -50,6 +59,15 @@ class Outcome(NamedTuple):
     renders: list[Rendered]  # N rays each; the last is the picture, before it the coarse network's
     terms: dict[str, Tensor]  # scalars by name, unweighted (weights in `avatar.losses`)
     evaluations: int  # of the field's networks
+
+
+def clearing(density: Tensor) -> Tensor:
+    """What is wrong with densities [P] per metre where nothing may be: mean of log(density / CLEAR_DENSITY), at least 0 each.
+
+    So that a rendering of whole rays with the same weights shows the same head. By the logarithm, because the density's own
+    gradient is gone long before it is small enough.
+    """
+    return torch.log(density.clamp_min(CLEAR_DENSITY) / CLEAR_DENSITY).mean()
 
 
 class RadianceAvatar(nn.Module):
@@ -92,7 +110,7 @@ class RadianceAvatar(nn.Module):
     @property
     def jitter_width(self) -> int:
         """Random numbers that a ray of `render` takes."""
-        return self.coarse_samples + self.fine_samples if self.hierarchical else self.max_samples
+        return self.coarse_samples + self.fine_samples if self.hierarchical else self.max_samples + 1
 
     def grid(self, vertices_m: np.ndarray) -> shell.Grid:
         """The shell of one posed head, vertices [V, 3]."""
@@ -124,10 +142,18 @@ class RadianceAvatar(nn.Module):
         if self.hierarchical:
             renders, terms, evaluations = self._coarse_to_fine(features.values, posed, rays, precision, jitter, window)
             return Outcome(renders, features.terms | terms, evaluations)
-        offsets = jitter or [None] * len(rays)
-        found = [sampling.in_shell(posed.grids[i], rays[i], self.step_m, self.max_samples, offsets[i]) for i in range(len(rays))]
-        rendered, _, terms = self._pass(self.field, features.values, posed, rays, found, precision, window)
-        return Outcome([rendered], features.terms | terms, sum(len(part.ray) for part in found))
+        offsets, heads = jitter or [None] * len(rays), range(len(rays))
+        found = [sampling.in_shell(posed.grids[i], rays[i], self.step_m, self.max_samples, offsets[i]) for i in heads]
+        met, clear = sum(len(part.ray) for part in found), None
+        if jitter and met:  # in training: the rays' last random number
+            clear = [self._outside(posed, i, jitter[i][:, -1]) for i in heads]
+        rendered, _, terms = self._pass(self.field, features.values, posed, rays, found, precision, window, clear=clear)
+        return Outcome([rendered], features.terms | terms, met + sum(len(part.ray) for part in clear or []))
+
+    def _outside(self, posed: Posed, head: int, numbers: np.ndarray) -> Packed:
+        """Places outside the shell of one head, a random one for each three numbers [N] in [0, 1)."""
+        few = numbers[: len(numbers) // 3 * 3].reshape(-1, 3)
+        return sampling.outside(posed.grids[head], posed.vertices_m[head].cpu().numpy(), few, head)
 
     def _coarse_to_fine(
         self,
@@ -167,13 +193,15 @@ class RadianceAvatar(nn.Module):
         precision: torch.dtype,
         window: float | None,
         regularise: bool = True,
+        clear: list[Packed] | None = None,
     ) -> tuple[Rendered, Tensor, dict[str, Tensor]]:
-        """One network at the samples of all heads. features: [B, V, C].
+        """One network at the samples of all heads. features: [B, V, C]; clear: places of each head where nothing may be.
 
-        Returns the rays, the weight [P] of each sample, and the warp's loss terms unless they are not asked for.
+        Returns the rays, the weight [P] of each sample, and loss terms: of these places, of the warp unless not asked for.
         """
         firsts = np.cumsum([0, *(len(part.origins_m) for part in rays)])
-        packed = sampling.join([sampling.pack(rays[i], found[i], i, firsts[i]) for i in range(len(rays))])
+        parts = [[sampling.pack(rays[i], found[i], i, firsts[i]), *(clear[i : i + 1] if clear else [])] for i in range(len(rays))]
+        packed = sampling.join([part for of_head in parts for part in of_head])
         device, vertices = features.device, posed.vertices_m.flatten(0, 1)
         points, directions, distance, step, ray, slot, closed, head = (torch.from_numpy(array).to(device) for array in packed)
         frame = self._latent_of(posed.condition)[head] if self.warp is not None and window is not None else None
@@ -181,13 +209,20 @@ class RadianceAvatar(nn.Module):
         index = torch.from_numpy(self._indices(posed, moved.detach().cpu().numpy(), packed)).to(device)
         terms = field.vertex_terms(features, precision).flatten(0, 1)
         density, colour = field(moved, directions, vertices, index, terms, precision)
+        outside, extra = slot == sampling.OUTSIDE_SLOT, {}
+        if outside.any():
+            extra = {"outside": clearing(density[outside])}
+            density, colour, distance, step, ray, slot, closed = (
+                array[~outside] for array in (density, colour, distance, step, ray, slot, closed)
+            )
         rendered, weight = composite(density * step + CLOSED * closed, colour, distance, ray, slot, firsts[-1])
         if frame is None or not regularise:
-            return rendered, weight, {}
+            return rendered, weight, extra
         # Nerfies' own reduction to one sample a ray: the Jacobian at all of them costs ten times as much as all else of the warp.
-        median = torch.from_numpy(sampling.median_samples(weight.detach().cpu().numpy(), packed.ray)).to(device)
+        kept = (~outside).nonzero()[:, 0]
+        median = kept[torch.from_numpy(sampling.median_samples(weight.detach().cpu().numpy(), ray.cpu().numpy())).to(device)]
         bent = elastic(self.warp.with_jacobian(points[median], frame[median], window)[1])
-        return rendered, weight, {"elastic": bent.sum() / max(len(bent), 1), "magnitude": magnitude(points, moved)}
+        return rendered, weight, extra | {"elastic": bent.sum() / max(len(bent), 1), "magnitude": magnitude(points, moved)}
 
     def _latent_of(self, condition: Condition) -> Tensor:
         """Rows [B] int64 of the warp's latents."""
@@ -213,11 +248,13 @@ class RadianceAvatar(nn.Module):
     def nearest(self, posed: Posed, head: int, points_m: np.ndarray) -> np.ndarray:
         """Vertices [P, K] that the field reads at points [P, 3] of one posed head, nearest first."""
         points_m = np.where(np.isfinite(points_m), points_m, 0)  # a tree refuses others; the field makes them a bad loss
-        wanted = self.field.neighbours
-        searched = wanted if self.mates is None else min(CANDIDATES * wanted, posed.vertices_m.shape[1])
-        if posed.vertices_m.device.type == "cpu":
-            found = nearest_by_tree(posed.trees[head], points_m, searched, torch.get_num_threads())
-        else:
-            there = torch.from_numpy(points_m).to(posed.vertices_m.device)
-            found = nearest_by_blocks(posed.vertices_m[head], there, searched).cpu().numpy()
+        wanted, vertices_m = self.field.neighbours, posed.vertices_m[head]
+        most = wanted if self.mates is None else min(CANDIDATES * wanted, len(vertices_m))
+        if vertices_m.device.type == "cpu":
+            threads = torch.get_num_threads()
+            if self.mates is None:
+                return nearest_by_tree(posed.trees[head], points_m, wanted, threads)
+            return nearest_mates(posed.trees[head], points_m, wanted, most, self.mates, threads)
+        there = torch.from_numpy(points_m).to(vertices_m.device)
+        found = nearest_by_blocks(vertices_m, there, most).cpu().numpy()
         return found if self.mates is None else keep_mates(found, self.mates, wanted)

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from avatar import shell
 from avatar.volume import Rays
 
 MARGIN_M = 0.08  # hair and beard stand off the mesh by no more (as `coverage.LARGEST_M`)
+OUTSIDE_SLOT = -1
+BESIDE_M = 0.04
 FLOOR = 1e-5  # of the weights that importance sampling follows (NeRF's), so that no stratum is ever without a chance
 
 
@@ -54,11 +55,37 @@ def bounds(vertices_m: np.ndarray, origins_m: np.ndarray) -> tuple[np.ndarray, n
     The sphere holds the posed vertices [V, 3] and MARGIN_M more; like the shell it ends at `shell.REACH_M` whatever the codes.
     The paper leaves the bounds silent; from the posed head of each frame they hold at any distance from the camera.
     """
-    within = np.clip(vertices_m.astype(np.float64), -shell.REACH_M, shell.REACH_M)
-    centre = within.mean(0)
-    radius = np.linalg.norm(within - centre, axis=1).max() + MARGIN_M
+    centre, radius = ball(vertices_m)
     away = np.linalg.norm(origins_m - centre, axis=1)
     return np.maximum(away - radius, 0), away + radius
+
+
+def ball(vertices_m: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre [3] and radius in m of the sphere in which `bounds` looks."""
+    within = np.clip(vertices_m.astype(np.float64), -shell.REACH_M, shell.REACH_M)
+    centre = within.mean(0)
+    return centre, float(np.linalg.norm(within - centre, axis=1).max() + MARGIN_M)
+
+
+def outside(grid: shell.Grid, vertices_m: np.ndarray, numbers: np.ndarray, head: int = 0) -> Packed:
+    """Points of the sphere of `bounds` that lie neither in the shell nor in the core; on no ray: slot OUTSIDE_SLOT.
+
+    numbers: [M, 3] in [0, 1), for a point each: every second is spread evenly over the sphere, the others lie up to BESIDE_M
+    from a vertex, where the field has most to forget. They are seen along no direction.
+    """
+    centre, radius = ball(vertices_m)
+    height, turn = 2 * numbers[:, 1] - 1, 2 * np.pi * numbers[:, 2]
+    flat = np.sqrt(1 - height**2)
+    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], 1)
+    points = centre + radius * np.cbrt(numbers[:, :1]) * directions
+    vertex, away = np.divmod(numbers[1::2, :1] * np.float64(len(vertices_m)), 1)
+    points[1::2] = vertices_m[vertex[:, 0].astype(np.int64)] + BESIDE_M * away * directions[1::2]
+    voxel = np.floor((points - grid.origin) / shell.VOXEL_M)
+    empty = ~((voxel >= 0) & (voxel < grid.labels.shape)).all(1)
+    empty[~empty] = grid.labels[tuple(voxel[~empty].astype(np.int64).T)] == shell.EMPTY
+    points, count = points[empty].astype(np.float32), int(empty.sum())
+    zeros, none = np.zeros(count, np.float32), np.zeros(count, np.int64)
+    return Packed(points, np.zeros_like(points), zeros, zeros, none, none + OUTSIDE_SLOT, none > 0, none + head)
 
 
 def uniform(near_m: np.ndarray, far_m: np.ndarray, count: int, jitter: np.ndarray | None) -> shell.Samples:
@@ -66,6 +93,12 @@ def uniform(near_m: np.ndarray, far_m: np.ndarray, count: int, jitter: np.ndarra
     offset = np.full((len(near_m), count), 0.5, np.float32) if jitter is None else jitter
     step = (far_m - near_m) / count
     return _flat(near_m[:, None] + (np.arange(count) + offset) * step[:, None], np.broadcast_to(step[:, None], offset.shape))
+
+
+def ended(grid: shell.Grid, rays: Rays, samples: shell.Samples) -> shell.Samples:
+    """Samples of whole rays with those behind the core's front closed: the core is part of what the field was trained with."""
+    behind = samples.distance_m >= shell.core_distance(grid, rays.origins_m, rays.directions)[samples.ray]
+    return samples._replace(closed=samples.closed | behind)
 
 
 def by_weight(
@@ -92,63 +125,6 @@ def by_weight(
     distance = np.sort(np.concatenate([coarse_m, near_m[:, None] + (stratum + inside) * width], 1), 1)
     edges = np.concatenate([near_m[:, None], (distance[:, 1:] + distance[:, :-1]) / 2, far_m[:, None]], 1)
     return _flat(distance, np.diff(edges, axis=1))
-
-
-def refine(
-    found: np.ndarray, count: np.ndarray, coarse: shell.Samples, weights: np.ndarray, met: np.ndarray
-) -> tuple[shell.Samples, np.ndarray]:
-    """The samples in the middles of a shell's strata, and as many more on each ray where these saw something.
-
-    found, count, met: from `shell.intervals`; coarse: P samples without jitter; weights: [P] of their rendering.
-    The new ones invert the coarse weights' distribution, constant inside a stratum, at evenly spaced levels. A sample stands
-    for the stretch of shell halfway to its neighbours; the last one of a ray that ends at the core is closed.
-    Returns 2 P samples, and for each its place among the coarse ones, or -1 for a new one.
-    """
-    size = 2 * len(coarse.ray)
-    distance, step = np.empty(size, np.float32), np.empty(size, np.float32)
-    ray, slot, old = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
-    arrays = np.asarray(coarse.step_m, np.float64), coarse.ray, np.asarray(weights, np.float64)
-    _refine(found, count, *arrays, distance, step, ray, slot, old)
-    last = np.append(ray[1:] != ray[:-1], True) if size else np.zeros(0, bool)
-    return shell.Samples(distance, step, ray, slot, last & met[ray]), old
-
-
-@numba.njit(cache=True)
-def _refine(found, count, stratum, rays, weights, distance, step, ray, slot, old):  # noqa: ANN001, ANN202
-    first, at = 0, 0
-    while first < len(rays):
-        n, last = rays[first], first
-        while last < len(rays) and rays[last] == n:
-            last += 1
-        number, width = last - first, stratum[first]
-        total = 0.0
-        for i in range(first, last):
-            total += weights[i] + FLOOR
-        along = np.empty(2 * number)  # in the shell, from its start
-        passed, bin_, drawn, taken = 0.0, 0, 0, 0
-        for rank in range(2 * number):
-            fine = np.inf
-            if drawn < number:
-                wanted = (drawn + 0.5) / number * total
-                while bin_ < number - 1 and passed + weights[first + bin_] + FLOOR < wanted:
-                    passed += weights[first + bin_] + FLOOR
-                    bin_ += 1
-                fine = (bin_ + min(max((wanted - passed) / (weights[first + bin_] + FLOOR), 0.0), 1.0)) * width
-            middle = (taken + 0.5) * width if taken < number else np.inf
-            if middle <= fine:
-                along[rank], old[at + rank], taken = middle, first + taken, taken + 1
-            else:
-                along[rank], old[at + rank], drawn = fine, -1, drawn + 1
-        interval, before = 0, 0.0
-        for rank in range(2 * number):
-            low = (along[rank] + along[rank - 1]) / 2 if rank else 0.0
-            high = (along[rank] + along[rank + 1]) / 2 if rank < 2 * number - 1 else number * width
-            while interval < count[n] - 1 and along[rank] > before + found[n, interval, 1] - found[n, interval, 0]:
-                before += found[n, interval, 1] - found[n, interval, 0]
-                interval += 1
-            distance[at + rank] = min(found[n, interval, 0] + along[rank] - before, found[n, interval, 1])
-            step[at + rank], ray[at + rank], slot[at + rank] = high - low, n, rank
-        at, first = at + 2 * number, last
 
 
 def median_samples(weights: np.ndarray, ray: np.ndarray) -> np.ndarray:

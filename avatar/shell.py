@@ -28,6 +28,14 @@ class Grid(NamedTuple):
     labels: np.ndarray  # [X, Y, Z] uint8: EMPTY, SHELL or CORE
 
 
+class PackedGrid(NamedTuple):
+    """A grid in a quarter of its memory."""
+
+    origin: np.ndarray  # [3] m
+    shape: tuple[int, ...]
+    bits: tuple[np.ndarray, np.ndarray]  # of SHELL and of CORE, [ceil(X Y Z / 8)] uint8 each
+
+
 class Samples(NamedTuple):
     """P packed samples of N rays, rays in order, front to back on each."""
 
@@ -68,6 +76,18 @@ def occupancy(vertices_m: np.ndarray, thickness_m: np.ndarray, core_m: np.ndarra
     labels[tuple(index.T)] = CORE
     _mark(labels, np.asarray(vertices_m, np.float64) - origin, np.asarray(thickness_m, np.float64), VOXEL_M)
     return Grid(origin, labels)
+
+
+def pack(grid: Grid) -> PackedGrid:
+    """What `unpack` makes the same grid of."""
+    return PackedGrid(grid.origin, grid.labels.shape, (np.packbits(grid.labels == SHELL), np.packbits(grid.labels == CORE)))
+
+
+def unpack(packed: PackedGrid) -> Grid:
+    """The grid of `pack`."""
+    count = int(np.prod(packed.shape))
+    inside, core = (np.unpackbits(bits, count=count) for bits in packed.bits)
+    return Grid(packed.origin, (SHELL * inside + CORE * core).reshape(packed.shape))
 
 
 @numba.njit(cache=True)
@@ -120,8 +140,35 @@ def intervals(
 
 @numba.njit(cache=True)
 def _march(labels, voxel, origins, directions, max_length, found, count, met):  # noqa: ANN001, ANN202
-    """Amanatides-Woo traversal; neighbouring shell voxels join into one interval.
+    """Neighbouring shell voxels join into one interval."""
+    start, stop, place = room(labels.shape)
+    for n in range(origins.shape[0]):
+        crossed, met[n] = cells(labels, voxel, origins[n], directions[n], max_length, start, stop, place)
+        number = 0
+        for i in range(crossed):
+            if i == 0 or start[i] != stop[i - 1]:
+                if number == found.shape[1]:
+                    met[n] = False
+                    break
+                found[n, number, 0] = start[i]
+                number += 1
+            found[n, number - 1, 1] = stop[i]
+        count[n] = number
 
+
+@numba.njit(cache=True)
+def room(shape):  # noqa: ANN001, ANN201
+    """Arrays that `cells` fills, for a grid of a shape: no ray crosses more voxels."""
+    size = shape[0] + shape[1] + shape[2] + 3
+    return np.empty(size), np.empty(size), np.empty(size, np.int64)
+
+
+@numba.njit(cache=True)
+def cells(labels, voxel, origin, direction, max_length, start, stop, place):  # noqa: ANN001, ANN201
+    """The shell's voxels that a ray crosses before the core or after `max_length` of shell: Amanatides-Woo traversal.
+
+    origin, direction: [3], from the grid's corner. Fills start, stop (along the ray) and place (in the flattened labels).
+    Returns their number and whether the ray ended at the core; where, is one more entry of start.
     Voxels that a ray only touches, at an edge or a corner, count for nothing: neither the core nor a gap.
     """
     shape = labels.shape
@@ -129,64 +176,73 @@ def _march(labels, voxel, origins, directions, max_length, found, count, met):  
     step = np.empty(3, np.int64)
     next_t = np.empty(3)
     delta = np.empty(3)
+    enter, leave = 0.0, np.inf
+    for axis in range(3):
+        o, d = origin[axis], direction[axis]
+        size = shape[axis] * voxel
+        if abs(d) < 1e-12:
+            if o < 0 or o >= size:
+                leave = -1.0
+        else:
+            near, far = -o / d, (size - o) / d
+            if near > far:
+                near, far = far, near
+            enter, leave = max(enter, near), min(leave, far)
+    if leave <= enter:
+        return 0, False
+    for axis in range(3):
+        o, d = origin[axis], direction[axis]
+        at = o + enter * d
+        cell[axis] = min(max(int(np.floor(at / voxel)), 0), shape[axis] - 1)
+        if abs(d) < 1e-12:
+            step[axis], next_t[axis], delta[axis] = 0, np.inf, np.inf
+        elif d > 0:
+            step[axis], delta[axis] = 1, voxel / d
+            next_t[axis] = ((cell[axis] + 1) * voxel - o) / d
+        else:
+            step[axis], delta[axis] = -1, -voxel / d
+            next_t[axis] = (cell[axis] * voxel - o) / d
+    t, length, number = enter, 0.0, 0
+    while True:
+        label = labels[cell[0], cell[1], cell[2]]
+        axis = 0
+        if next_t[1] < next_t[axis]:
+            axis = 1
+        if next_t[2] < next_t[axis]:
+            axis = 2
+        after = min(max(next_t[axis], t), leave)
+        if label == CORE and after > t:
+            start[number] = t
+            return number, True
+        if label == SHELL and after > t:
+            start[number], stop[number] = t, after
+            place[number] = (cell[0] * shape[1] + cell[1]) * shape[2] + cell[2]
+            number += 1
+            length += after - t
+            if length >= max_length:
+                return number, False
+        t = after
+        cell[axis] += step[axis]
+        if cell[axis] < 0 or cell[axis] >= shape[axis] or t >= leave:
+            return number, False
+        next_t[axis] += delta[axis]
+
+
+def core_distance(grid: Grid, origins_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Metres [N] along each ray at which it meets the core, inf where it does not; arguments as of `intervals`."""
+    distance = np.full(len(origins_m), np.inf)
+    origins = np.asarray(origins_m, np.float64) - grid.origin
+    _meet(grid.labels, VOXEL_M, origins, np.asarray(directions, np.float64), distance)
+    return distance
+
+
+@numba.njit(cache=True)
+def _meet(labels, voxel, origins, directions, distance):  # noqa: ANN001, ANN202
+    start, stop, place = room(labels.shape)
     for n in range(origins.shape[0]):
-        enter, leave = 0.0, np.inf
-        for axis in range(3):
-            o, d = origins[n, axis], directions[n, axis]
-            size = shape[axis] * voxel
-            if abs(d) < 1e-12:
-                if o < 0 or o >= size:
-                    leave = -1.0
-            else:
-                near, far = -o / d, (size - o) / d
-                if near > far:
-                    near, far = far, near
-                enter, leave = max(enter, near), min(leave, far)
-        if leave <= enter:
-            continue
-        for axis in range(3):
-            o, d = origins[n, axis], directions[n, axis]
-            at = o + enter * d
-            cell[axis] = min(max(int(np.floor(at / voxel)), 0), shape[axis] - 1)
-            if abs(d) < 1e-12:
-                step[axis], next_t[axis], delta[axis] = 0, np.inf, np.inf
-            elif d > 0:
-                step[axis], delta[axis] = 1, voxel / d
-                next_t[axis] = ((cell[axis] + 1) * voxel - o) / d
-            else:
-                step[axis], delta[axis] = -1, -voxel / d
-                next_t[axis] = (cell[axis] * voxel - o) / d
-        t, length, number, inside = enter, 0.0, 0, False
-        while True:
-            label = labels[cell[0], cell[1], cell[2]]
-            axis = 0
-            if next_t[1] < next_t[axis]:
-                axis = 1
-            if next_t[2] < next_t[axis]:
-                axis = 2
-            after = min(max(next_t[axis], t), leave)
-            if label == CORE and after > t:
-                met[n] = True
-                break
-            if label == SHELL and after > t:
-                if not inside:
-                    if number == found.shape[1]:
-                        break
-                    found[n, number, 0] = t
-                    number += 1
-                    inside = True
-                length += after - t
-                found[n, number - 1, 1] = after
-                if length >= max_length:
-                    break
-            elif after > t:
-                inside = False
-            t = after
-            cell[axis] += step[axis]
-            if cell[axis] < 0 or cell[axis] >= shape[axis] or t >= leave:
-                break
-            next_t[axis] += delta[axis]
-        count[n] = number
+        crossed, met = cells(labels, voxel, origins[n], directions[n], np.inf, start, stop, place)
+        if met:
+            distance[n] = start[crossed]
 
 
 def sample(

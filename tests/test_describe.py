@@ -133,3 +133,10 @@ def test_the_command_line_describes_presets_and_refuses_what_it_does_not_know(
         main(["--describe", "papers", "--head", str(tmp_path / "head.npz")])
     with pytest.raises(SystemExit, match="there is no head model"):
         main(["--describe", "demo", "--head", str(tmp_path / "none.npz")])
+
+
+def test_a_layered_avatar() -> None:
+    avatar = build.build(settings_of("layers", layers=4, bases=1, texture_size=32), HEAD)
+    rows = {row.name: row for row in layers_of(avatar, HEAD)}
+    assert rows["out"].flop_test == 2 * 64 * 4 * (2 + 4 + 1) * 64 * 64 and rows["out"].unit == "frame"
+    assert rows[""].parameters == 4 * 32 * 32 * 8 and "textures" in describe(settings_of("layers"), HEAD, "layers")

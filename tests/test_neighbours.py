@@ -5,14 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from toy_head import toy_head
 
 from avatar.neighbours import (
     DETOUR,
     FARTHEST_M,
     SLACK_M,
+    all_mates,
     keep_mates,
     nearest_by_tree,
+    nearest_mates,
     resting_and_shut,
     surface_mates,
     tree_of,
@@ -93,6 +96,22 @@ def test_kept_candidates_are_mates_of_the_nearest_in_order() -> None:
     lonely = keep_mates(index, np.eye(len(vertices), dtype=bool), 4)
     assert (lonely == index[:, :1]).all()
     assert keep_mates(index[:0], mates, 4).shape == (0, 4)
+
+
+@pytest.mark.parametrize("k", [1, 4])
+def test_searching_few_first_finds_the_same_mates(k: int) -> None:
+    """As all candidates at once: between two strips that nearly touch, at their joint, and far away."""
+    random = np.random.default_rng(0)
+    vertices, triangles = strips(0.001)
+    mates, tree = surface_mates([vertices], triangles), tree_of(vertices)
+    points = vertices[random.integers(0, 120, 400)] + random.normal(size=(400, 3)) * random.choice([0.0007, 0.05], (400, 1))
+    found = nearest_mates(tree, points, k, 3 * k, mates)
+    np.testing.assert_array_equal(found, keep_mates(nearest_by_tree(tree, points, 3 * k), mates, k))
+    nearest = nearest_by_tree(tree, points, k)
+    together = np.array([all(mates[row[0], v] for v in row) for row in nearest])
+    np.testing.assert_array_equal(all_mates(nearest, mates), together)
+    assert k == 1 or (together.any() and not together.all())
+    assert nearest_mates(tree, points[:0], k, 3 * k, mates).shape == (0, k)
 
 
 def test_a_closed_mouth_reads_one_lip_at_a_time() -> None:

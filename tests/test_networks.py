@@ -19,6 +19,7 @@ from avatar.networks import (
     enlarging_blocks,
     linear_in,
     positional_encoding,
+    train_in,
 )
 
 
@@ -104,3 +105,23 @@ def test_no_strided_pointwise_convolution() -> None:
 
 def test_best_precision_is_bfloat16_or_float32() -> None:
     assert best_precision("cpu") in (torch.bfloat16, torch.float32)
+
+
+def test_training_in_bfloat16_stays_near_and_pictures_are_exact() -> None:
+    torch.manual_seed(0)
+    unet, maps = UNet(3, 8), torch.randn(2, 3, 64, 64)
+    with torch.no_grad():
+        exact = unet(maps)
+    unet(maps).square().sum().backward()
+    gradients = [parameter.grad.clone() for parameter in unet.parameters()]
+    unet.zero_grad()
+    train_in(nn.Sequential(unet), torch.bfloat16)
+    near = unet(maps)
+    assert near.dtype == torch.float32 and 1e-6 < (near - exact).norm() / exact.norm() < 0.03
+    near.square().sum().backward()
+    cosines = [
+        torch.cosine_similarity(p.grad.flatten(), g.flatten(), 0) for p, g in zip(unet.parameters(), gradients, strict=True)
+    ]
+    assert all(parameter.grad.dtype == torch.float32 for parameter in unet.parameters()) and min(cosines) > 0.95
+    with torch.no_grad():
+        torch.testing.assert_close(unet(maps), exact, atol=1e-5, rtol=1e-4)

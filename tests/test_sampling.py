@@ -73,37 +73,64 @@ def test_points_of_several_heads_are_one_batch() -> None:
     np.testing.assert_allclose(packed.points_m[4], [0, packed.distance_m[4], 0])
 
 
-@pytest.mark.parametrize("kind", ["random", "one", "none"])
-def test_refine_equals_a_loop_that_inverts_the_weights(kind: str) -> None:
+def test_places_outside_the_shell_fill_the_ball_around_the_head() -> None:
     random = np.random.default_rng(3)
-    found, count = np.zeros((6, shell.MAX_INTERVALS, 2)), np.array([1, 3, 0, 2, 1, 4])
-    for n, number in enumerate(count):
-        found[n, :number] = 0.4 + np.cumsum(random.uniform(0.001, 0.02, 2 * number)).reshape(number, 2)
-    met = random.random(6) < 0.5
-    coarse = shell.sample(found, count, 0.004, 7, None, met)
-    weights = {"random": random.random(len(coarse.ray)), "one": (coarse.slot == 1) * 1.0, "none": 0.0 * coarse.slot}[kind]
-    samples, old = sampling.refine(found, count, coarse, weights, met)
-    assert len(samples.ray) == 2 * len(coarse.ray) and sorted(old[old >= 0]) == list(range(len(coarse.ray)))
-    for n in np.flatnonzero(count):
-        own, before = samples.ray == n, coarse.ray == n
-        lengths = np.diff(found[n, : count[n]], axis=1)[:, 0]
-        total, number = lengths.sum(), before.sum()
-        probability = (weights[before] + sampling.FLOOR) / (weights[before] + sampling.FLOOR).sum()
-        levels = np.concatenate([[0], np.cumsum(probability)])
-        drawn = np.interp((np.arange(number) + 0.5) / number, levels, np.linspace(0, total, number + 1))
-        along = np.sort(np.concatenate([(np.arange(number) + 0.5) * total / number, drawn]))
-        interval = np.searchsorted(np.cumsum(lengths), along - 1e-9).clip(0, count[n] - 1)
-        expected = found[n, interval, 0] + along - np.concatenate([[0], np.cumsum(lengths)])[interval]
-        np.testing.assert_allclose(samples.distance_m[own], expected, atol=1e-6)
-        edges = np.concatenate([[0], (along[1:] + along[:-1]) / 2, [total]])
-        np.testing.assert_allclose(samples.step_m[own], np.diff(edges), atol=1e-6)
-        assert samples.slot[own].tolist() == list(range(2 * number))
-        assert samples.closed[own].tolist() == [False] * (2 * number - 1) + [bool(met[n])]
-        np.testing.assert_allclose(samples.distance_m[own][old[own] >= 0], coarse.distance_m[before], atol=1e-6)
-    empty, none = sampling.refine(
-        found[2:3], count[2:3], shell.sample(found[2:3], count[2:3], 0.1, 3, None), weights[:0], met[2:3]
+    grid = shell.Grid(np.array([-0.02, 0, 0.01]), random.integers(0, 3, (26, 25, 27)).astype(np.uint8))
+    vertices, numbers = random.normal(size=(40, 3)) * 0.02, random.random((3000, 3))
+    found = sampling.outside(grid, vertices, numbers, 2)
+    centre, radius = sampling.ball(vertices)
+    far_grid = shell.Grid(centre + 9, np.zeros((1, 1, 1), np.uint8))
+    far = np.linalg.norm(found.points_m - centre, axis=1) / radius
+    even = np.linalg.norm(sampling.outside(far_grid, vertices, numbers).points_m[::2] - centre, axis=1) / radius
+    assert far.max() <= 1 and abs((even < 0.5 ** (1 / 3)).mean() - 0.5) < 0.05  # half of the volume
+    beside = sampling.outside(far_grid, vertices, numbers).points_m[1::2]
+    away = np.linalg.norm(beside[:, None] - vertices, axis=-1).min(1)
+    assert (
+        away.max() <= sampling.BESIDE_M + 1e-6
+        and len(np.unique(np.linalg.norm(beside[:, None] - vertices, axis=-1).argmin(1))) > 30
     )
-    assert len(empty.ray) == len(none) == 0
+    for point in found.points_m[:300]:
+        voxel = np.floor((point - grid.origin) / shell.VOXEL_M).astype(int)
+        within = (voxel >= 0).all() and (voxel < grid.labels.shape).all()
+        assert not within or grid.labels[tuple(voxel)] == shell.EMPTY
+    assert 1000 < len(found.ray) < 3000 and (found.slot == sampling.OUTSIDE_SLOT).all() and (found.head == 2).all()
+    full = shell.Grid(centre - 0.5, np.full((250, 250, 250), shell.SHELL, np.uint8))
+    assert not len(sampling.outside(full, vertices, numbers).ray) and not len(sampling.outside(grid, vertices, numbers[:0]).ray)
+
+
+def test_whole_rays_end_where_they_meet_the_core() -> None:
+    labels = np.zeros((5, 5, 10), np.uint8)
+    labels[2, 2, 6:8], labels[2, 2, 3] = shell.CORE, shell.SHELL
+    grid = shell.Grid(np.zeros(3), labels)
+    origins = np.array([[0.01, 0.01, -0.1], [0.002, 0.01, -0.1], [0.01, 0.01, 0.2]], np.float32)
+    rays = Rays(origins, np.array([[0, 0, 1], [0, 0, 1], [0, 0, -1]], np.float32))
+    found = shell.core_distance(grid, *rays)
+    assert found[[0, 2]] == pytest.approx([0.1 + 6 * shell.VOXEL_M, 0.2 - 8 * shell.VOXEL_M]) and np.isinf(found[1])
+    samples = sampling.ended(grid, rays, sampling.uniform(np.zeros(3), np.full(3, 0.3), 50, None))
+    assert (samples.closed == (samples.distance_m >= found[samples.ray])).all() and 0 < samples.closed.sum() < 100
+
+
+def test_training_clears_what_lies_outside_the_shell() -> None:
+    """The term alone takes the fog of a new network away where it looks; only a step's random numbers ask for it."""
+    head = toy_head(24, 36)
+    scene = Scene(head, toy_track(head, 2, 40), [0])
+    rows, columns = np.mgrid[:40:2, :40:2]
+    rays, random = scene.rays(0, columns.ravel(), rows.ravel()), np.random.default_rng(0)
+    torch.manual_seed(0)
+    avatar = build.build(build.settings_of(TrainConfig(**SMALL)), head)
+    avatar.shape_shell(torch.full((head.vertex_count,), 0.008), torch.zeros(0, 3))
+    posed, optimiser, terms = avatar.pose(*scene.heads([0], "cpu")), torch.optim.Adam(avatar.parameters(), 3e-3), []
+    for _ in range(20):
+        jitter = random.random((len(rays.origins_m), avatar.jitter_width), dtype=np.float32)
+        outcome = avatar.render(posed, [rays], torch.float32, [jitter])
+        terms.append(outcome.terms["outside"])
+        optimiser.zero_grad()
+        terms[-1].backward()
+        optimiser.step()
+    assert terms[0] > 5 and terms[-1] < 1
+    within = sampling.in_shell(posed.grids[0], rays, avatar.step_m, avatar.max_samples, None)
+    assert 0 < outcome.evaluations - len(within.ray) <= len(rays.origins_m) / 3
+    assert not avatar.render(posed, [rays], torch.float32).terms
 
 
 def test_median_samples_equal_a_loop() -> None:

@@ -135,3 +135,14 @@ def test_normals_point_outwards_and_flat_triangles_do_no_harm(head: tuple[np.nda
     normals = vertex_normals(vertices, triangles)
     assert np.isfinite(normals).all() and ((normals * vertices).sum(1) > 0).all()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
+
+
+def test_a_packed_grid_is_the_same_in_a_quarter_of_the_memory() -> None:
+    random = np.random.default_rng(0)
+    for shape in ((5, 7, 3), (1, 1, 1), (8, 8, 8)):
+        grid = shell.Grid(random.normal(size=3), random.integers(0, 3, shape).astype(np.uint8))
+        packed = shell.pack(grid)
+        found = shell.unpack(packed)
+        np.testing.assert_array_equal(found.labels, grid.labels)
+        assert found.labels.dtype == np.uint8 and (found.origin == grid.origin).all()
+        assert sum(bits.nbytes for bits in packed.bits) <= grid.labels.size / 4 + 2

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from toy_head import toy_head, toy_images, toy_track
 
-from avatar import marching, sampling, shell, train
+from avatar import guide, marching, sampling, shell, train
 from avatar.config import TrainConfig
 from avatar.radiance import Posed, RadianceAvatar
 from avatar.volume import Rays, Rendered
@@ -69,16 +69,19 @@ def train_in(folder: Path, inputs: dict[str, Path], code: str = "c", **keys: obj
 
 
 def marched_in_one_pass(avatar: RadianceAvatar, posed: Posed, rays: Rays) -> Rendered:
-    """What `march` draws in the shell, with every sample of every ray evaluated: no blocks, no early end, no pruning."""
+    """What `march` draws in the shell, layer by layer in one pass, from the density of every voxel, whether seen or not."""
 
-    def seen(samples: shell.Samples) -> tuple[Rendered, torch.Tensor]:
-        packed = sampling.pack(rays, samples)
-        index = torch.from_numpy(avatar.nearest(posed, 0, packed.points_m))
+    def seen(points_m: np.ndarray, directions: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        index = torch.from_numpy(avatar.nearest(posed, 0, points_m))
         terms = avatar.field.vertex_terms(avatar.source(posed.condition).values, torch.float32)[0]
-        points, along = torch.from_numpy(packed.points_m), torch.from_numpy(packed.directions)
-        return marching.composited(samples, *avatar.field(points, along, posed.vertices_m[0], index, terms), len(count))
+        return avatar.field.plainly(*map(torch.from_numpy, (points_m, directions)), posed.vertices_m[0], index, terms)
 
+    grid, most = posed.grids[0], round(avatar.max_samples * marching.GUIDED)
+    place = np.argwhere(grid.labels == shell.SHELL)
+    centres = ((place + 0.5) * shell.VOXEL_M + grid.origin).astype(np.float32)
+    density = np.full(grid.labels.shape, guide.UNKNOWN)
     with torch.no_grad():
-        found, count, met = shell.intervals(posed.grids[0], rays.origins_m, rays.directions)
-        coarse = shell.sample(found, count, 2 * avatar.step_m, avatar.max_samples // 2, None, met)
-        return seen(sampling.refine(found, count, coarse, seen(coarse)[1].numpy(), met)[0])[0]
+        density[tuple(place.T)] = seen(centres, np.zeros_like(centres))[0].numpy()
+        samples = guide.guided(grid, density, rays, avatar.step_m, most, marching.END)
+        packed = sampling.pack(rays, samples)
+        return marching.composited(samples, *seen(packed.points_m, packed.directions), len(rays.origins_m))[0]
