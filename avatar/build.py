@@ -32,6 +32,9 @@ MODEL_FIELDS = (
     "max_samples",
     "coarse_samples",
     "fine_samples",
+    "layers",
+    "bases",
+    "texture_size",
 )
 
 
@@ -53,7 +56,10 @@ def build(settings: dict[str, Any], head: HeadModel) -> nn.Module:
 
 def content(avatar: nn.Module, settings: dict[str, Any], head: HeadModel, **more: Any) -> dict[str, Any]:
     """What an avatar file holds: tensors and plain values only, so that it loads with weights_only."""
-    weights = {name: value for name, value in avatar.state_dict().items() if not name.startswith(TRAINING_ONLY)}
+    if hasattr(avatar, "packed"):
+        weights = avatar.packed()
+    else:
+        weights = {name: value for name, value in avatar.state_dict().items() if not name.startswith(TRAINING_ONLY)}
     return {"settings": settings, "head_digest": head.digest, "head_name": head.name, "weights": weights, **more}
 
 
@@ -67,6 +73,9 @@ def restore(stored: dict[str, Any], head: HeadModel) -> nn.Module:
             f"the avatar was trained on head model {stored['head_name']} {stored['head_digest']}, found {head.name} {head.digest}"
         )
     avatar = build(stored["settings"], head)
+    if hasattr(avatar, "unpack"):
+        avatar.unpack(stored["weights"])
+        return avatar.eval()
     for name in ("thickness_m", "core_m"):  # buffers whose size comes from the data
         if name in stored["weights"] and hasattr(avatar, name):
             setattr(avatar, name, torch.empty_like(stored["weights"][name]))

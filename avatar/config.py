@@ -22,8 +22,10 @@ def modules_of(representation: str, training: bool = False) -> tuple[str, ...]:
 class TrainConfig(StepConfig):
     """train: fit the avatar to the training frames."""
 
-    representation: Literal["ours_d", "ours_c", "displacement_mlp", "codes_mlp", "codes", "static"] = Field(
-        "ours_d", description="Source of the vertex features; a module of `avatar/features/`."
+    representation: Literal["ours_d", "ours_c", "displacement_mlp", "codes_mlp", "codes", "static", "layers"] = Field(
+        "ours_d",
+        description="Source of the vertex features of the paper's field, or `layers` for the stack of textured surfaces: a "
+        "module of `avatar/features/`.",
     )
     sampling: Literal["shell", "hierarchical"] = Field(
         "shell", description="One network in a shell around the mesh, or the paper's coarse and fine ones on the whole ray."
@@ -60,6 +62,9 @@ class TrainConfig(StepConfig):
     fine_samples: int = Field(
         128, ge=1, le=1024, description="Hierarchical: samples added where the first network saw something, for the second."
     )
+    layers: int = Field(8, ge=3, le=16, description="Layers: surfaces, the inner parts' included.")
+    bases: int = Field(3, ge=0, le=8, description="Layers: textures that the network mixes into the static one.")
+    texture_size: int = Field(512, ge=64, le=2048, description="Layers: texels a side of each surface's texture.")
 
 
 class RenderConfig(StepConfig):

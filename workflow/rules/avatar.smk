@@ -10,6 +10,7 @@ rule train:
         alpha="results/{subject}/trim/alpha.npy",
         track="results/{subject}/fit/track.npz",
         split=split_of,
+        vgg=perceptual_of,
     output:
         avatar="results/{subject}/{variant}/avatar.pt",
         curve="results/{subject}/{variant}/curve.tsv",

@@ -132,6 +132,12 @@ def model_code_of(command):
     return code
 
 
+def perceptual_of(wildcards):
+    """Weights of the perceptual loss, for a representation that learns from images."""
+    learning = modules_of(TRAINED[wildcards.variant]["train"].representation, training=True)[-1]
+    return asset("lpips_vgg16.ckpt") if learning.endswith(".images") else []
+
+
 def asset(name):
     """Path of a fetched file. Its content is fixed by its sha256 (see `sha_of`), so its time says nothing."""
     return ancient(f"resources/assets/{name}")
