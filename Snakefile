@@ -25,6 +25,7 @@ include: "workflow/rules/report.smk"
 include: "workflow/rules/simulate.smk"
 include: "workflow/rules/tracking.smk"
 include: "workflow/rules/ablation.smk"
+include: "workflow/rules/speed_error.smk"
 include: "workflow/rules/published.smk"
 
 

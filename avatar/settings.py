@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from avatar.config import EvaluateConfig
 from avatar.published.config import ComparisonConfig
 from avatar.report.config import PageConfig, PlotConfig
+from avatar.speed_error.config import SpeedErrorConfig
 from avatar.uses.config import (
     AnimateConfig,
     DriveConfig,
@@ -63,6 +64,7 @@ class Settings(BaseModel):
     flicker: FlickerConfig = FlickerConfig()
     drive: DriveConfig = DriveConfig()
     drivers: dict[str, DriverConfig] = Field(default_factory=dict, description="Driving videos by name, for `snakemake drive`.")
+    speed_error: SpeedErrorConfig = SpeedErrorConfig()
     plot: PlotConfig = PlotConfig()
     page: PageConfig = PageConfig()
 

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv")
 RESERVED_SUBJECTS = frozenset(
-    {"ablation", "available", "identity", "index", "plots", "published", "tables", "tracking_benchmark"}
+    {"ablation", "available", "identity", "index", "plots", "published", "speed_error", "tables", "tracking_benchmark"}
 )
 """Names under `results/` that belong to all subjects together."""
 RESERVED_VARIANTS = frozenset(

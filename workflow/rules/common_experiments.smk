@@ -1,7 +1,8 @@
-# What the rules of simulated clips, the tracking benchmark and the ablation share. Names of common.smk are known here.
+# What the rules of simulated clips, the tracking benchmark, the ablation and the speed table share. Names of common.smk are known here.
 from types import SimpleNamespace
 
 from avatar.ablation import settings as ablation_settings
+from avatar.speed_error import settings as speed_settings
 from fitting.config import BenchmarkConfig, SimulateConfig
 
 
@@ -76,3 +77,57 @@ def ablation_rows(wildcards):
     """Rows of the simulated subject and of the user's own that have a face."""
     pattern = "results/ablation/rows/{}/{}/{}.json"
     return [pattern.format(*row) for row in ablation_settings.planned(list(filter(accepted, SUBJECTS)))]
+
+
+if SETTINGS.speed_error.subject:
+    try:
+        checks.check_names([SETTINGS.speed_error.subject], SUBJECTS, "speed_error.subject", CONFIG)
+    except checks.SettingsError as mistake:
+        raise SystemExit(str(mistake)) from None
+PRESETS = {
+    path.stem: TrainConfig(
+        **checks.read_preset(path.stem, path.parent, {"train": TrainConfig, "render": RenderConfig}).get("train") or {}
+    )
+    for path in sorted((Path(workflow.basedir) / "config" / "presets").glob("*.yaml"))
+}
+SPEED_TRAININGS, SPEED_CELLS = speed_settings.trainings(PRESETS), speed_settings.cells(PRESETS)
+SPEED_COSTS = speed_settings.costs(PRESETS)
+TIMED_INPUTS = {
+    "head": HEAD,
+    "frames": "results/{subject}/frames/frames.npy",
+    "alpha": "results/{subject}/trim/alpha.npy",
+    "track": "results/{subject}/fit/track.npz",
+    "split": "results/{subject}/split.json",
+}
+ALL_CORES = workflow.cores or 8
+
+
+def speed_assets(wildcards):
+    """Networks that a training compares pictures with."""
+    layers = SPEED_TRAININGS[wildcards.training].config.representation == "layers"
+    return {"vgg": asset("lpips_vgg16.ckpt")} if layers else {}
+
+
+def speed_training_of(training, name):
+    """A file of one training of `speed_error`."""
+    return f"results/speed_error/{{subject}}/trainings/{training}/{name}"
+
+
+def speed_code(command, training_of):
+    """As `model_code_of`, for the representation of the training that a cell needs. training_of: cell's name -> training's."""
+
+    def code(wildcards):
+        cell = next(value for name, value in wildcards.items() if name != "subject")
+        modules = modules_of(SPEED_TRAININGS[training_of(cell)].config.representation, training=True)
+        return digest_of(command, modules if "rendering" not in command else modules[:-1])
+
+    return code
+
+
+def speed_error_files(wildcards):
+    """Tables and plot of the config's subject, or of the first one that has a face."""
+    chosen = SETTINGS.speed_error.subject or next(filter(accepted, SUBJECTS), None)
+    if chosen is None:
+        raise ValueError("speed_error: none of the videos has a face")
+    names = ("table.csv", "table.md", "table.tex", "plot.svg", "report.json")
+    return [f"results/speed_error/{chosen}/{name}" for name in names]
