@@ -68,8 +68,10 @@ def fingerprint(job: step.Job) -> str:
     digest.update(
         json.dumps([provenance[key] for key in ("config", "code", "versions", "device", "threads")], sort_keys=True).encode()
     )
-    for name in ("head", "frames", "alpha", "track", "split"):
-        with open(getattr(job.input, name), "rb") as file:
+    for name in ("head", "frames", "alpha", "track", "split", "vgg"):
+        if not (path := getattr(job.input, name, None)):
+            continue  # not every representation reads each of them
+        with open(path, "rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
 
@@ -101,18 +103,20 @@ def resume(job: step.Job, path: Path, mark: str, avatar: nn.Module, optimiser: t
     """The state to continue from: the checkpoint's when it was made by equal code, config and inputs, else a new one."""
     if not path.exists():
         return State()
-    fresh = copy.deepcopy((avatar.state_dict(), optimiser.state_dict()))
+    fresh = None
     try:
-        stored = torch.load(path, map_location=job.device, weights_only=True)
+        stored = torch.load(path, map_location="cpu", weights_only=True)
         if stored["fingerprint"] != mark:
             job.log.info("starting afresh: the checkpoint %s was made with another config, code or input", path)
             return State()
+        fresh = copy.deepcopy((avatar.state_dict(), optimiser.state_dict()))
         avatar.load_state_dict(stored["avatar"])
         optimiser.load_state_dict(stored["optimiser"])
     except (RuntimeError, KeyError, EOFError, OSError, ValueError, pickle.UnpicklingError) as error:
         job.log.info("starting afresh: the checkpoint %s cannot be read (%s)", path, error)
-        avatar.load_state_dict(fresh[0])  # it may have been read in part
-        optimiser.load_state_dict(fresh[1])
+        if fresh:  # it may have been read in part
+            avatar.load_state_dict(fresh[0])
+            optimiser.load_state_dict(fresh[1])
         return State()
     state = State(**stored["state"] | {"recent": deque(stored["state"]["recent"], maxlen=BAD_WINDOW)})
     job.log.info("continuing at step %d of %d", state.step, job.config.steps)

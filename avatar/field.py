@@ -77,7 +77,7 @@ class Field(nn.Module):
         Encoding, weights, heads and outputs are float32 (or the points' own type); hidden layers run in `precision`.
         Returns density [P] per metre, >= 0, and colour [P, 3] in [0, 1].
         """
-        if len(points_m) and field_kernel.fits(self, points_m, vertices_m):
+        if len(points_m) and field_kernel.fits(self, points_m, directions, vertices_m, terms):
             density, colour = field_kernel.evaluate(self, points_m, directions, vertices_m, index, terms, precision)
             return density / DENSITY_LENGTH_M, colour
         return self.plainly(points_m, directions, vertices_m, index, terms, precision)

@@ -56,16 +56,17 @@ class Block(NamedTuple):
     shade: Tensor
 
 
-def fits(field: Field, points_m: Tensor, vertices_m: Tensor) -> bool:
-    """Whether `evaluate` may be used: on CPU, with constant samples and vertices, and weights whose NaN it cannot hide."""
+def fits(field: Field, points_m: Tensor, directions: Tensor, vertices_m: Tensor, terms: Tensor) -> bool:
+    """Whether `evaluate` may be used: on CPU, with constant samples and vertices, and nothing that is not finite.
+
+    oneDNN's fused ReLU makes 0 of NaN, which must show.
+    """
     constant = not torch.is_grad_enabled() or not (points_m.requires_grad or vertices_m.requires_grad)
-    return points_m.device.type == "cpu" and constant and finite(field)
-
-
-def finite(field: Field) -> bool:
-    """Whether all weights are: oneDNN's fused ReLU makes 0 of NaN."""
+    if points_m.device.type != "cpu" or not constant:
+        return False
     with torch.no_grad():
-        return all(bool(torch.isfinite(parameter.sum())) for parameter in field.parameters())
+        read = (points_m, directions, vertices_m, terms, *field.parameters())
+        return all(bool(torch.isfinite(values.sum())) for values in read)
 
 
 def parameters_of(field: Field) -> list[Tensor]:
@@ -93,7 +94,7 @@ def pool(threads: int) -> ThreadPoolExecutor:
 
 
 def each(work: Callable, items: Iterable) -> list:
-    """Results of `work` on all items in their order, on as many threads as PyTorch has: the same bits on any number."""
+    """Results of `work` on all items in their order, on as many threads as PyTorch has."""
     items, threads = list(items), torch.get_num_threads()
     return list(map(work, items)) if threads == 1 or len(items) == 1 else list(pool(threads).map(work, items))
 

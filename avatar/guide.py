@@ -16,7 +16,7 @@ from avatar.volume import Rays
 
 UNKNOWN = np.float32(-1)  # density of a voxel that no ray was seen to need
 AHEAD = 6  # voxels that a ray asks for at a time: 24 mm
-LOOKS = 16384  # rays that look for voxels: of a larger picture every second, third...
+LOOKS = 16384  # rays that look for voxels at a time
 FAINT = 2e-4  # share of a ray's light below which a cell between two others like it is empty
 # Samples follow the length by this part and the weights by the rest. nerface.mp4, three frames, dB to 0.5 mm steps in the shell:
 # by half 52.1, by 0.7 52.4.
@@ -31,19 +31,19 @@ def seen_density(
 
     density_at: of points [P, 3]. UNKNOWN elsewhere. Returns it and the number of evaluations.
     """
-    density = np.full(grid.labels.shape, UNKNOWN)
-    stride = -(-len(rays.origins_m) // LOOKS) if len(rays.origins_m) else 1
-    origins, directions = (np.asarray(array[::stride], np.float64) for array in rays)
-    origins, evaluations = origins - grid.origin, 0
-    while len(origins):
-        wanted, waiting = np.zeros(grid.labels.shape, bool), np.zeros(len(origins), bool)
-        _look(grid.labels, shell.VOXEL_M, origins, directions, density, end, AHEAD, wanted, waiting)
-        place = np.argwhere(wanted)
-        if not len(place):
-            break
-        centres = ((place + 0.5) * shell.VOXEL_M + grid.origin).astype(np.float32)
-        density[tuple(place.T)] = np.maximum(density_at(centres), 0)
-        origins, directions, evaluations = origins[waiting], directions[waiting], evaluations + len(place)
+    density, evaluations = np.full(grid.labels.shape, UNKNOWN), 0
+    for first in range(0, len(rays.origins_m), LOOKS):
+        origins, directions = (np.asarray(array[first : first + LOOKS], np.float64) for array in rays)
+        origins = origins - grid.origin
+        while len(origins):
+            wanted, waiting = np.zeros(grid.labels.shape, bool), np.zeros(len(origins), bool)
+            _look(grid.labels, shell.VOXEL_M, origins, directions, density, end, AHEAD, wanted, waiting)
+            place = np.argwhere(wanted)
+            if not len(place):
+                break
+            centres = ((place + 0.5) * shell.VOXEL_M + grid.origin).astype(np.float32)
+            density[tuple(place.T)] = np.maximum(density_at(centres), 0)
+            origins, directions, evaluations = origins[waiting], directions[waiting], evaluations + len(place)
     return density, evaluations
 
 
@@ -91,7 +91,7 @@ def _guide(
     at = 0
     for n in range(len(origins)):
         count, met = shell.cells(labels, voxel, origins[n], directions[n], np.inf, start, stop, place)
-        count = _shares(count, start, stop, place, flat, end, weight, share)
+        count = _shares(met, count, start, stop, place, flat, end, weight, share)
         if not count:
             continue
         kept = 0.0
@@ -118,7 +118,7 @@ def _guide(
 
 
 @numba.njit(cache=True)
-def _shares(count, start, stop, place, flat, end, weight, share):  # noqa: ANN001, ANN202
+def _shares(met, count, start, stop, place, flat, end, weight, share):  # noqa: ANN001, ANN202
     """Keeps a ray's cells that hold light or lie beside such, in place, with the share of its samples; returns their number."""
     light, beyond, lit = 1.0, 0, 0
     for i in range(count):
@@ -131,6 +131,8 @@ def _shares(count, start, stop, place, flat, end, weight, share):  # noqa: ANN00
             beyond += 1
         if beyond == 2:  # one more than the cell in which light ended: its centre may lie behind the surface
             break
+    if met and lit and beyond < 2:
+        weight[lit - 1] += light  # the core ends it
     kept, whole, total = 0, 0.0, 0.0
     for i in range(lit):
         widest = weight[i]

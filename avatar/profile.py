@@ -22,7 +22,7 @@ from torch import nn
 
 from avatar import build, field_kernel, field_loops, guide, losses, marching, radiance, sampling, train
 from avatar.checkpoint import State
-from avatar.config import TrainConfig
+from avatar.config import RenderConfig, TrainConfig
 from avatar.dataset import Scene
 from avatar.learning import rays as learning
 from avatar.networks import best_precision
@@ -214,7 +214,9 @@ def main() -> None:
     if arguments.avatar:
         data, head = train.load(job()), load_head(arguments.head)
         avatar = build.restore(torch.load(arguments.avatar, weights_only=True), head)
-        avatar.sharpen(2.0)
+        if not hasattr(avatar, "field"):
+            raise SystemExit("this profile is of fields; `python -m avatar.play.timing` has a layered avatar's")
+        avatar.sharpen(RenderConfig().sample_factor)
         for stride in map(int, arguments.strides.split(",")):
             view = data.scene.view(data.train[0], data.alpha.shape[1:]).every(stride)
             print("\n".join(drawing(job(), avatar, data.scene, view, data.train[0], 3)))  # noqa: T201

@@ -19,7 +19,7 @@ from fitting.video import write_video
 from workflow import step
 
 COUNTED = (
-    "all work of a frame never seen before: head model, features (U-Net where there is one), shell, field, compositing; "
+    "all work of a frame never seen before: head model, networks, geometry, drawing, in PyTorch's types (`play` is faster); "
     "loading the avatar, reading and writing files are left out"
 )
 
@@ -91,7 +91,7 @@ def run(job: step.Job) -> None:
             "ms": [round(value, 1) for value in milliseconds],
             "ms_counts": COUNTED,
             "size": list(size),
-            "precision": str(precision).split(".")[1],
+            "precision": str(getattr(avatar, "precision", precision)).split(".")[1],
             "evaluations_per_frame": evaluations // len(chosen),
             "evaluations_per_ray": round(evaluations / (len(chosen) * size[0] * size[1]), 3),
             "evaluations_per_covered_ray": round(evaluations / max(covered, 1), 3),

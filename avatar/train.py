@@ -114,7 +114,7 @@ def loop(job: step.Job, learner: Learner, data: Data, state: State, path: Path, 
             state.losses.append(optimise(learner, state))
             state.seconds = before + time.perf_counter() - started
             if state.step % every == 0 or state.step == config.steps:
-                quality = learning.probe_psnr(learner, data, job.device)
+                quality = learning.probe_psnr(learner, data)
                 state.curve.append([state.step, state.seconds, float(np.mean(state.losses)), quality])
                 job.log.info("step %d: loss %.4f, probe %.2f dB, %.0f s", *(state.curve[-1][i] for i in (0, 2, 3, 1)))
                 state.losses = []

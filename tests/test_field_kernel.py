@@ -110,6 +110,17 @@ def test_weights_that_are_not_finite_show() -> None:
     assert density.isnan().all() and colour.isnan().all() and gradients["features"].isnan().any()
 
 
+@pytest.mark.parametrize("which", ["points", "directions", "terms"])
+def test_what_is_not_finite_shows(which: str) -> None:
+    field = small_field(torch.float32)
+    points, directions, vertices, index, features = question(field, 10, torch.float32)
+    terms = field.vertex_terms(features, torch.float32)
+    {"points": points, "directions": directions, "terms": terms}[which][:] = float("nan")
+    with torch.no_grad():
+        density, colour = field(points, directions, vertices, index, terms, torch.float32)
+    assert colour.isnan().all() and (which == "directions" or density.isnan().all())
+
+
 def test_points_or_vertices_with_gradients_and_no_points_go_layer_by_layer(monkeypatch: pytest.MonkeyPatch) -> None:
     field = small_field(torch.float64)
     points, directions, vertices, index, features = question(field, 10, torch.float64)

@@ -60,6 +60,8 @@ def twin(grid: shell.Grid, density: np.ndarray, origin: np.ndarray, direction: n
         beyond += light < end
         if beyond == 2:
             break
+    if met and weights and beyond < 2:
+        weights[-1] += light
     widest = [max(weights[max(i - 1, 0) : i + 2]) for i in range(len(weights))]
     kept = [(cell, w) for cell, w in zip(cells, widest, strict=False) if w > guide.FAINT]
     if not kept:
@@ -93,7 +95,8 @@ def test_guided_samples_equal_a_loop_over_every_voxel(step: float, most: int, en
     assert 30 < hit <= 60 and samples.closed.any() and not samples.closed.all()
 
 
-def test_only_voxels_that_light_reaches_are_evaluated() -> None:
+def test_only_voxels_that_light_reaches_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guide, "LOOKS", 64)  # several lots of rays, all of which look
     grid, density = grid_of(3)
     density = np.maximum(density, 0)
     rays, asked = rays_through(grid, 400, 4), []

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 import torch
 from torch.nn import functional
 
+from avatar.layered import threads
 from avatar.layered.draw import Textures, draw, quantised
 from avatar.layered.raster import Fragments
 
@@ -103,16 +103,13 @@ def test_wild_maps_draw_something_finite_and_nothing_else_is_touched() -> None:
             draw(quantised(textures), maps, fragments)
 
 
-def test_threads_strides_and_buffers_change_nothing() -> None:
+def test_threads_strides_and_buffers_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     textures, maps, fragments = case()
     stored = quantised(textures)
     whole = draw(stored, maps, fragments)
-    before = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
+    for count in (1, 2, 5):
+        monkeypatch.setattr(threads, "count", lambda count=count: count)
         assert (draw(stored, maps, fragments) == whole).all()
-    finally:
-        numba.set_num_threads(before)
     strided = np.ascontiguousarray(maps.transpose(0, 3, 1, 2)).transpose(0, 2, 3, 1)
     buffer = np.full((HEIGHT, WIDTH, 4), 7, np.uint8)
     assert draw(stored, strided, fragments, buffer) is buffer and (buffer == whole).all()

@@ -16,7 +16,6 @@ from toy_run import train_in, write_subject
 from avatar import lpips, train
 from avatar.dataset import Scene, on_white
 from avatar.layered.perceptual import Perceptual
-from avatar.learning import images
 from avatar.learning.alignment import Alignment
 
 KEYS = {"representation": "layers", "layers": 5, "bases": 2, "texture_size": 64}
@@ -39,7 +38,7 @@ def test_it_learns(inputs: dict[str, Path], tmp_path: Path) -> None:
     outputs = train_in(tmp_path / "run", inputs, steps=60, **KEYS)
     report = json.loads(outputs["report"].read_text())
     curve = np.loadtxt(outputs["curve"], skiprows=1)
-    assert report["skipped_steps"] == 0 and report["probe_psnr"] > 24 and curve[-1, 3] > curve[0, 3] + 1
+    assert report["skipped_steps"] == 0 and report["probe_psnr"] > 30 and curve[-1, 3] > curve[0, 3] + 1
     assert outputs["avatar"].stat().st_size < 10e6
 
 
@@ -129,9 +128,3 @@ def test_perceptual_distance(vgg: Path, assets: Path) -> None:
     assert torch.isfinite(other.grad).all() and other.grad.abs().sum() > 0
     with pytest.raises(ValueError, match="VGG16"):
         Perceptual(lpips.load(assets / "lpips_alexnet.ckpt"), torch.float32)
-
-
-def test_dissimilarity_is_ssims() -> None:
-    image = torch.rand(1, 3, 20, 20)
-    assert images.dissimilarity(image, image).abs() < 1e-6
-    assert images.dissimilarity(image, 1 - image) > images.dissimilarity(image, 0.9 * image) > 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -14,7 +13,7 @@ from toy_head import toy_head, toy_track
 from avatar import build
 from avatar.config import TrainConfig
 from avatar.dataset import Scene
-from avatar.layered import posing
+from avatar.layered import posing, threads
 from avatar.live import Live
 from avatar.uses.sequence import Camera
 from fitting.head_model import HeadModel
@@ -138,15 +137,12 @@ def test_a_layered_avatar_is_drawn_as_its_own_picture(head, avatar, track) -> No
     assert 0 < np.abs(lower.astype(int) - first).mean() < 3
 
 
-def test_threads_do_not_change_the_picture_nor_torch(head, avatar, track) -> None:  # noqa: ANN001
-    before, torches = numba.get_num_threads(), torch.get_num_threads()
+def test_threads_do_not_change_the_picture_nor_torch(head, avatar, track, monkeypatch) -> None:  # noqa: ANN001
+    torches = torch.get_num_threads()
     live, images = Live(avatar, head, track["shape"], camera_of(track), torch.float32), []
-    try:
-        for threads in {1, numba.config.NUMBA_NUM_THREADS}:
-            numba.set_num_threads(threads)
-            images.append(live.frame(row_of(track, 1)))
-    finally:
-        numba.set_num_threads(before)
+    for count in (1, 2, 3):
+        monkeypatch.setattr(threads, "count", lambda count=count: count)
+        images.append(live.frame(row_of(track, 1)))
     assert all((image == images[0]).all() for image in images)
     assert torch.get_num_threads() == torches
 

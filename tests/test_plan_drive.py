@@ -43,7 +43,7 @@ def test_a_driver_is_tracked_and_never_trains_and_a_rejected_one_holds_back_no_o
     assert [line for line in ran if line.startswith("avatar.uses.drive ")] == ["avatar.uses.drive ann"]
     assert (folder / "results/ann/a/drive/good/drive.mp4").exists() and "fitting.split ann" in ran
     text = (folder / "results/ann/a/drive/good/drive.json").read_text()
-    assert r"\"use\":\"pose\"" in text and r"\"driver\":\"good\"" in text and r"\"sample_factor\":2.0" in text
+    assert r"\"use\":\"pose\"" in text and r"\"driver\":\"good\"" in text and r"\"sample_factor\":3.0" in text
     assert pipeline.plan("drive") <= {"drive"}
     uses = pipeline.run("-n", "uses")
     assert "driver blind: left out, its video is rejected" in uses.text and "rule orbit_around" in uses.text

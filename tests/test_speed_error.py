@@ -66,7 +66,7 @@ def test_everything_that_can_be_chosen_is_compared() -> None:
     assert len(keys) == len({(name, config.model_dump_json()) for name, config in keys}) == len(cells) < len(rows)
     plans = settings.table_config(PRESETS).rows
     assert list(plans) == list(rows) and {plan.cell for plan in plans.values()} == set(cells)
-    assert plans["shell_16"].cell == plans["end_0.004"].cell == plans["kind_ours_d"].cell
+    assert plans["shell_24"].cell == plans["end_0.004"].cell == plans["kind_ours_d"].cell
     assert {row.group for row in rows.values()} == set(settings.GROUPS)
     for name in settings.costs(PRESETS):
         assert name.split("_")[0] in ("frames", "pixels", "vertices")

@@ -135,7 +135,7 @@ def resolve_device(name: str) -> str:
 
 
 def set_threads(count: int) -> None:
-    """Set the thread count of torch, OpenCV and the BLAS libraries that are already loaded."""
+    """Set the thread count of torch, OpenCV, numba and the BLAS libraries that are already loaded."""
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(limits=count)
@@ -143,6 +143,8 @@ def set_threads(count: int) -> None:
         sys.modules["torch"].set_num_threads(count)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(count)
+    if "numba" in sys.modules:
+        sys.modules["numba"].set_num_threads(min(count, sys.modules["numba"].config.NUMBA_NUM_THREADS))
 
 
 def _pairs(items: list[str]) -> SimpleNamespace:

@@ -29,7 +29,7 @@ LARGEST_MOVE = 0.03  # of a fetch in UV: what tracking and shape are wrong by, n
 MOVES_M = 0.003  # expressions move the skin by millimetres: inputs of about one
 WIDTH = 64  # channels of the U-Net's output
 START = 0.02  # standard deviation of the output layer's weights: at the start the static texture is all there is
-BASIS_START = 0.05  # of the bases: a basis of zeros would never get a gradient, nor its weight
+BASIS_START = 0.01  # of the bases: a basis of zeros would never get a gradient, nor its weight
 
 
 @dataclass
@@ -60,6 +60,8 @@ def _begin(module: nn.Module) -> None:
 
 class LayeredAvatar(nn.Module):
     """Displacement -> U-Net -> maps; textures and maps -> pixels."""
+
+    precision = torch.float32  # of `picture`, whatever is asked for; `avatar.live` draws in others
 
     def __init__(self, settings: dict, head: HeadModel) -> None:
         """settings: `layers`, `bases`, `texture_size` and `uv_size`; see `avatar.build.settings_of`."""
@@ -121,6 +123,9 @@ class LayeredAvatar(nn.Module):
     def unpack(self, stored: dict) -> None:
         """Take over what `packed` gave. Raises ValueError, RuntimeError or KeyError when it does not fit."""
         self.textures = packing.unpacked_textures(stored["textures"], tuple(self.textures.shape)).to(self.textures.device)
+        networks = {name for name in self.state_dict() if name.startswith(("unet.", "out."))}
+        if networks != set(stored["networks"]):
+            raise KeyError(f"the file's network has other layers: {sorted(networks ^ set(stored['networks']))[:3]}")
         self.load_state_dict(self.state_dict() | {name: value.float() for name, value in stored["networks"].items()})
         self.thickness_m = stored["thickness_m"].to(self.thickness_m)
         self.offsets_m = stored["offsets_m"].to(self.offsets_m)

@@ -27,6 +27,7 @@ def packed_textures(textures: Tensor) -> dict[str, Tensor]:
 
 def unpacked_textures(stored: dict[str, Tensor], shape: tuple[int, int, int, int]) -> Tensor:
     """Textures [L, R, R, C] from `packed_textures`; raises ValueError when they are not of this shape."""
+    stored = {name: value.cpu() for name, value in stored.items()}
     layers, rows, columns, channels = shape
     try:
         planes = np.frombuffer(zlib.decompress(stored["bytes"].numpy().tobytes()), np.uint8)

@@ -67,6 +67,7 @@ def around(head: HeadModel, offsets_m: np.ndarray, surface_m: np.ndarray) -> np.
     average = averaging(head)
     for _ in range(SMOOTHING // 2):
         placed[1:-3] = (average @ placed[1:-3].T).T
+    placed[1:-3] = np.minimum(placed[1:-3], placed[0])
     return placed.astype(np.float32)
 
 

@@ -8,7 +8,7 @@ two. Nor may some of numba's backends be called from two threads at once, as a s
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 
 import numba
@@ -30,6 +30,9 @@ def run(work: Callable[[int], None], shares: int) -> None:
     Raises what a share raised.
     """
     others = [_pool(shares - 1).submit(work, share) for share in range(1, shares)]
-    work(0)
+    try:
+        work(0)
+    finally:  # what they write into may be used again right after
+        wait(others)
     for other in others:
         other.result()

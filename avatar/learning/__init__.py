@@ -45,6 +45,7 @@ class Learner(Protocol):
 
     avatar: nn.Module
     optimiser: torch.optim.Optimizer
+    device: str  # that the avatar learns on
 
     def rates(self, number: int) -> None:
         """Set the optimiser's learning rates for step `number`."""
@@ -71,13 +72,13 @@ def measured_shell(data: Data) -> np.ndarray:
 
 
 @torch.no_grad()
-def probe_psnr(learner: Learner, data: Data, device: str) -> float:
+def probe_psnr(learner: Learner, data: Data) -> float:
     """Mean PSNR in dB over the held-out training frames, on every PROBE_STRIDE-th pixel."""
     values = []
     for frame in data.probe:
         image = on_white(data.frames[frame][::PROBE_STRIDE, ::PROBE_STRIDE], data.alpha[frame][::PROBE_STRIDE, ::PROBE_STRIDE])
         view = data.scene.view(frame, data.alpha.shape[1:]).every(PROBE_STRIDE)
-        posed = learner.avatar.pose(*data.scene.heads([frame], device))
+        posed = learner.avatar.pose(*data.scene.heads([frame], learner.device))
         colour = learner.avatar.picture(posed, view, learner.precision())[0].colour.cpu()
         values.append(losses.psnr(colour, torch.from_numpy(image.reshape(-1, 3))))
     return float(np.mean(values))

@@ -45,7 +45,7 @@ class Alignment:
         """
         smooth, wanted = (cv2.GaussianBlur(part, (0, 0), SMOOTH_PX) for part in (image[..., :3], truth))
         across, down = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=1, scale=0.5) for order in ((1, 0), (0, 1)))
-        solid = (image[..., 3] > SOLID) & (depth_m > 0)
+        solid = (image[..., 3] > SOLID) & (depth_m > 0) & np.isfinite(smooth).all(-1)
         solid[[0, -1]], solid[:, [0, -1]] = False, False
         kept = np.zeros_like(solid)
         kept[::STRIDE, ::STRIDE] = solid[::STRIDE, ::STRIDE]
@@ -73,4 +73,6 @@ class Alignment:
         weight = 1 / (NOISE**2 * CORRELATED)
         prior = np.diag(1 / PRIOR**2)
         matrix, right = weight * jacobian.T @ jacobian + prior, weight * jacobian.T @ residual - prior @ self.moves[place]
-        self.moves[place] += GAIN * np.linalg.solve(matrix, right)
+        move = GAIN * np.linalg.solve(matrix, right)
+        if np.isfinite(move).all():  # one bad window must not turn every frame, by way of the mean
+            self.moves[place] += move

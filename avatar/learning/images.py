@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from avatar import build, lpips
 from avatar.dataset import on_white
@@ -18,35 +17,20 @@ from avatar.layered.texel_adam import BETAS, TexelAdam
 from avatar.learning import Data, Loss, measured_shell
 from avatar.learning.alignment import Alignment
 from avatar.networks import best_precision
+from fitting.head_model import REGIONS
 from workflow import step
 
 WINDOW_PX, LOOKED_AT_PX = 256, 128  # sides of a step's window, and of the part that the perceptual loss looks at
 PROJECTED = 60  # training frames whose colours the textures start from
-PERCEPTUAL_WEIGHT = 0.1
-OPACITY_WEIGHT = 0.1
-STRUCTURE_WEIGHT = 0.0
+PERCEPTUAL_WEIGHT = 0.2
 FACE_SHARE = 0.5  # of the windows are centred on a landmark, the others anywhere on the head
 SPREAD_PX = 15.0
 # Learning rates: of the networks, and of the textures' static logits and bases.
 NETWORK_RATE, STATIC_RATE, BASIS_RATE = 1e-3, 0.03, 0.02
 WARM_UP = 100  # steps
 STIR = 0.1  # standard deviation of how far the network's input is moved towards another frame's
-PERCEPTUAL_FROM = 0.3  # of the steps: before, colours alone settle what moves, at a third of the time a step
-ALIGN = True
+PERCEPTUAL_FROM = 0.15  # of the steps: before, colours alone settle what moves, in steps of less time
 ALIGNED_FROM = 0.25  # of the steps: before, the render says little
-
-
-def dissimilarity(first: Tensor, second: Tensor) -> Tensor:
-    """1 - SSIM of images [B, 3, H, W] in [0, 1], over boxes of 7 pixels a side: a scalar in [0, 2]."""
-
-    def mean(values: Tensor) -> Tensor:
-        return functional.avg_pool2d(values, 7, 1)
-
-    one, two = mean(first), mean(second)
-    spread, other = mean(first * first) - one * one, mean(second * second) - two * two
-    both = mean(first * second) - one * two
-    similarity = (2 * one * two + 1e-4) * (2 * both + 9e-4) / ((one * one + two * two + 1e-4) * (spread + other + 9e-4))
-    return 1 - similarity.mean()
 
 
 class ImageOptimiser:
@@ -80,7 +64,7 @@ class ImageOptimiser:
         """Take over what `state_dict` gave."""
         self.networks.load_state_dict(state["networks"])
         self.texels.load_state_dict(state["texels"])
-        self.alignment.moves[...] = state["moves"].numpy()
+        self.alignment.moves[...] = state["moves"].cpu().numpy()
 
 
 class ImageLearner:
@@ -88,7 +72,12 @@ class ImageLearner:
 
     def __init__(self, job: step.Job, data: Data) -> None:
         """A fresh avatar with projected textures, or what `avatar.checkpoint` then loads into it."""
-        self.config, self.data, self.device = job.config, data, job.device
+        # On the CPU whatever the device: compositing and textures learn in compiled passes. A GPU draws (`composite.reference`).
+        self.config, self.data, self.device = job.config, data, "cpu"
+        if REGIONS.index("mouth_cavity") not in data.head.region:
+            job.log.warning(
+                "the head model has no mouth cavity: an open mouth will show what lies behind; set head.mouth_cavity: true"
+            )
         torch.manual_seed(job.config.seed)
         self.avatar = build.build(build.settings_of(job.config), data.head)
         self.avatar.shape_shell(torch.from_numpy(measured_shell(data)))
@@ -96,11 +85,12 @@ class ImageLearner:
         for begin in (initial.settle, initial.project):
             begin(self.avatar, data.scene, data.frames, data.alpha, chosen)
         self.optimiser = ImageOptimiser(self.avatar, len(data.scene.frames))
-        self.perceptual = Perceptual(lpips.load(job.input.vgg, network="vgg16"), best_precision(job.device))
+        self.perceptual = Perceptual(lpips.load(job.input.vgg, network="vgg16"), best_precision(self.device))
 
     def rates(self, number: int) -> None:
         """Exponential decay to a tenth, after a short linear rise."""
-        factor = 0.1 ** (number / self.config.steps) * min(1.0, (number + 1) / WARM_UP)
+        factor = self.config.learning_rate / 1e-3  # the rates below are those at its default
+        factor *= 0.1 ** (number / self.config.steps) * min(1.0, (number + 1) / WARM_UP)
         for group in self.optimiser.networks.param_groups:
             group["lr"] = NETWORK_RATE * factor
         self.optimiser.texels.rates[:4], self.optimiser.texels.rates[4:] = STATIC_RATE * factor, BASIS_RATE * factor
@@ -139,21 +129,18 @@ class ImageLearner:
         frame = self.data.train[random.integers(len(self.data.train))]
         posed = self.avatar.pose(*self.data.scene.heads([frame], self.device, training=True))
         view, middle = self.data.scene.view(frame, self.data.alpha.shape[1:]), posed.layers_m[-1].mean(0).astype(np.float64)
-        if ALIGN:
-            view = self.optimiser.alignment.applied(self.data.scene.place[frame], view, middle)
+        view = self.optimiser.alignment.applied(self.data.scene.place[frame], view, middle)
         view, place = self.window(frame, posed, view, random)
         texels, maps = self.optimiser.texels, self.avatar.maps(posed, view, self.stirred(posed, view, random))
         fragments = self.avatar.fragments(posed, view)
         image, depth, count = composite.composite(self.avatar.textures, maps, fragments, texels.gradient, texels.touched)
         matte = torch.from_numpy(self.data.alpha[frame][place] / np.float32(255))
         truth = torch.from_numpy(on_white(self.data.frames[frame][place], self.data.alpha[frame][place]))
-        if ALIGN and number >= ALIGNED_FROM * self.config.steps:
+        if number >= ALIGNED_FROM * self.config.steps:
             drawn = image.detach().numpy(), depth.numpy(), truth.numpy()
             self.optimiser.alignment.learn(self.data.scene.place[frame], view, middle, *drawn)
-        value = (image[..., :3] - truth).abs().mean() + OPACITY_WEIGHT * (image[..., 3] - matte).abs().mean()
+        value = (image[..., :3] - truth).abs().mean() + self.config.opacity_weight * (image[..., 3] - matte).abs().mean()
         pair = [part.permute(2, 0, 1)[None] for part in (image[..., :3], truth)]
-        if STRUCTURE_WEIGHT:
-            value = value + STRUCTURE_WEIGHT * dissimilarity(*pair)
         if number < PERCEPTUAL_FROM * self.config.steps:
             return Loss(value, [frame], count)
         row, column = (int(random.integers(0, max(side - LOOKED_AT_PX, 0) + 1)) for side in truth.shape[:2])

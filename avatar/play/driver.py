@@ -127,8 +127,9 @@ class Driver:
                         finder = self._open_finder()
                         finder.__enter__()
                     done = self._one(finder, picture, time_s)
-                except (ValueError, RuntimeError, cv2.error) as error:
-                    done = self._kept(f"the picture cannot be used: {str(error).splitlines()[0][:200]}")
+                except Exception as error:  # noqa: BLE001 - whatever it is, the page must be told and the thread go on
+                    why = (str(error).splitlines() or [type(error).__name__])[0][:200]
+                    done = self._kept(f"the picture cannot be used: {why}")
                 with self._changed:
                     self._result = done
                 self._tell()

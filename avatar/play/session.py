@@ -253,8 +253,8 @@ class Session:
                 picture = jpeg(image, self._quality)
                 times = drawers[size].milliseconds | {"jpeg": 1e3 * (time.perf_counter() - started)}
                 facts |= self._figures(times, result) | {"size": list(image.shape[:2])}
-            except (ValueError, RuntimeError) as error:
-                facts["fault"] = str(error).splitlines()[0]
+            except Exception as error:  # noqa: BLE001 - whatever it is, the page must be told and the thread go on
+                facts["fault"] = (str(error).splitlines() or [type(error).__name__])[0]
             with self._changed:
                 self._shown = Shown(self._shown.number + 1 if self._shown else 1, picture, facts)
                 self._changed.notify_all()

@@ -24,7 +24,7 @@ import torch
 
 from avatar import build, train
 from avatar.checkpoint import State
-from avatar.config import modules_of
+from avatar.config import RenderConfig, modules_of
 from avatar.dataset import Scene
 from avatar.frames import chosen_frames
 from avatar.networks import best_precision
@@ -78,7 +78,7 @@ def of_pixels(job: step.Job, work: Path) -> dict[str, Any]:
     head = load_head(job.input.head)
     avatar = build.restore(torch.load(job.input.avatar, map_location=job.device, weights_only=True), head).to(job.device)
     if hasattr(avatar, "sharpen"):
-        avatar.sharpen(2.0)  # as `render` does by default
+        avatar.sharpen(RenderConfig().sample_factor)
     with np.load(job.input.track, allow_pickle=False) as file:
         track = {name: file[name] for name in file.files}
     frames = chosen_frames(step.read_json(job.input.split)["test"], job.config.pictures)

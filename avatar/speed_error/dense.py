@@ -21,22 +21,28 @@ def march(
     uniform: samples in the middles of equal strata between the bounds of `sampling.bounds`.
     fine: more of them where those saw something, as the paper's second network has them; all are evaluated anew then, as two
         networks would: uniform + (uniform + fine) evaluations a ray.
+    Rays end at a shell's core: it is part of what the field was trained with.
     """
     terms = avatar.field.vertex_terms(avatar.source(posed.condition).values, precision).flatten(0, 1)
     marcher, parts, evaluations = Marcher(avatar, posed, terms, precision), [], 0
     vertices = posed.vertices_m[0].cpu().numpy()
     for some in chunks(rays, DENSE_CHUNK):
         near, far = sampling.bounds(vertices, some.origins_m)
-        samples = sampling.uniform(near, far, uniform, None)
+        samples = ended(posed, some, sampling.uniform(near, far, uniform, None))
         rendered, weight = seen(marcher, some, samples)
         evaluations += len(samples.ray)
         if fine:
             distance, weight = samples.distance_m.reshape(-1, uniform), weight.cpu().numpy().reshape(-1, uniform)
-            samples = sampling.by_weight(near, far, distance, weight, fine, None)
+            samples = ended(posed, some, sampling.by_weight(near, far, distance, weight, fine, None))
             rendered, _ = seen(marcher, some, samples)
             evaluations += len(samples.ray)
         parts.append(rendered)
     return Rendered(*(torch.cat(column).cpu() for column in zip(*parts, strict=True))), evaluations
+
+
+def ended(posed: Posed, rays: Rays, samples: shell.Samples) -> shell.Samples:
+    """Samples that end at the core of a shell, where the avatar has one."""
+    return sampling.ended(posed.grids[0], rays, samples) if posed.grids else samples
 
 
 def seen(marcher: Marcher, rays: Rays, samples: shell.Samples) -> tuple[Rendered, Tensor]:

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from avatar import build, evaluate, lpips, marching, regions
+from avatar.config import RenderConfig
 from avatar.dataset import Scene
 from avatar.frames import chosen_frames
 from avatar.networks import best_precision
@@ -30,7 +31,7 @@ from fitting import extract
 from fitting.files import load_head
 from workflow import step
 
-SAMPLE_FACTOR = 2.0  # as `render` has it by default
+SAMPLE_FACTOR = RenderConfig().sample_factor
 OPAQUE = 127  # of 255: a ray of the head
 HEAD_FRAMES = 2  # whose head is drawn once more, to count
 METRICS = ("psnr", "ssim", "lpips", "iou", "psnr_face", "lpips_face", "psnr_mouth", "lpips_mouth")

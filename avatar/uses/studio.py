@@ -20,7 +20,7 @@ from fitting.files import load_head
 from fitting.head_model import HeadModel
 from workflow import step
 
-COUNTED = "shell and trees around the posed mesh, U-Net, rays; not: posing the mesh, reading, drawing and writing files"
+COUNTED = "geometry around the posed mesh, networks, rendering; not: posing the mesh, reading, making pictures and writing files"
 
 
 @dataclass
@@ -78,7 +78,7 @@ class Studio:
             "counted": COUNTED,
             "evaluations_per_frame": sum(picture.evaluations for picture in pictures) // len(pictures),
             "sample_factor": self.sample_factor,
-            "precision": str(self.precision).split(".")[1],
+            "precision": str(getattr(self.avatar, "precision", self.precision)).split(".")[1],
         }
 
     def usable(self, frames: Sequence[int]) -> list[int]:

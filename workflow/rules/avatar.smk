@@ -27,6 +27,7 @@ rule train:
     params:
         config=variant_config("train"),
         code=model_code_of("avatar.train"),
+        asset=perceptual_sha_of,
         run=step("avatar.train", device=True),
     shell:
         "{params.run} --config {params.config:q} --code {params.code} > {log:q} 2>&1"

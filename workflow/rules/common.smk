@@ -138,6 +138,11 @@ def perceptual_of(wildcards):
     return asset("lpips_vgg16.ckpt") if learning.endswith(".images") else []
 
 
+def perceptual_sha_of(wildcards):
+    """As `perceptual_of`, the content."""
+    return sha_of("lpips_vgg16.ckpt") if perceptual_of(wildcards) else ""
+
+
 def asset(name):
     """Path of a fetched file. Its content is fixed by its sha256 (see `sha_of`), so its time says nothing."""
     return ancient(f"resources/assets/{name}")
