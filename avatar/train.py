@@ -1,4 +1,4 @@
-"""train: fit an avatar to the training frames. One visible loop; interrupted runs continue at their step, to the bit on CPU."""
+"""train: fit an avatar to the training frames. One visible loop; interrupted runs continue at their step, to the bit on one thread."""
 
 from __future__ import annotations
 
