@@ -41,7 +41,7 @@ def checked(paths: dict[str, Path], avatar: Path) -> dict:
     """The report, after what every use promises: a video that names its avatar, and what its milliseconds count."""
     report = json.loads(paths["report"].read_text())
     assert report["synthetic"] and report["avatar_sha256"] == provenance.avatar_sha256(avatar)
-    assert report["ms_per_frame"] > 0 and "U-Net" in report["counted"] and report["sample_factor"] == 1.0
+    assert report["ms_per_frame"] > 0 and "networks" in report["counted"] and report["sample_factor"] == 1.0
     if "video" in paths:
         provenance.check(paths["video"], avatar)
     return report

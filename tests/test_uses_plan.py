@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pipeline import Pipeline
 
-CONFIG = "videos: videos\nvariants: {a: {preset: demo}, b: {preset: demo, render: {sample_factor: 3}}}\n"
+CONFIG = "videos: videos\nvariants: {a: {preset: demo}, b: {preset: demo, render: {sample_factor: 4}}}\n"
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_other_targets_follow_from_the_same_avatars(pipeline: Pipeline) -> None:
     wanted = {f"{rule} ann/{variant}" for rule in ("extrapolate_codes", "sheet_of", "animate_by") for variant in "ab"}
     assert asked - {"orbit", "extrapolate", "sheet", "animate"} == wanted
     text = pipeline.run("-n", "-p", "animate", "sheet").text
-    assert '"sample_factor":3.0' in text and '"sample_factor":2.0' in text and "file=wave.csv" in text and '"fps":12.0' in text
+    assert '"sample_factor":4.0' in text and '"sample_factor":3.0' in text and "file=wave.csv" in text and '"fps":12.0' in text
     (pipeline.folder / "wave.csv").write_text("jawOpen\n0\n")  # the same content at another time
     done = pipeline.run("animate")
     assert done.code == 0, done.text
