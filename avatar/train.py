@@ -1,4 +1,4 @@
-"""train: fit an avatar to the training frames. One visible loop; interrupted runs continue at their step, to the bit on one thread."""
+"""train: fit an avatar to the training frames. One visible loop; what was interrupted continues, on one thread to the bit."""
 
 from __future__ import annotations
 

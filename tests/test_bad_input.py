@@ -75,7 +75,10 @@ def test_config_of_a_run(pipeline: Pipeline, argument: str, expected: str) -> No
         ("extract: {size: 1, max_frames: 1}", "extract.size is 1, but input should be greater than or equal to 64; extract.max"),
         ("variants: {demo: {train: {steps: -3}}}", "variants.demo.train.steps is -3, but"),
         ("variants: {demo: {prset: fast}}", "variants.demo.prset is not a key; did you mean variants.demo.preset?"),
-        ("variants: {demo: {preset: quick}}", "config/presets: there is no preset 'quick'; the presets are demo, fast, layers, paper"),
+        (
+            "variants: {demo: {preset: quick}}",
+            "config/presets: there is no preset 'quick'; the presets are demo, fast, layers, paper",
+        ),
         ("variants: {fit: {preset: demo}}", "variants.fit: this name is taken"),
         ("variants: {export: {preset: demo}}", "variants.export: this name is taken"),
         ("variants: {mean_frame: {preset: demo}}", "variants.mean_frame: this name is taken"),
