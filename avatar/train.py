@@ -135,7 +135,7 @@ def run(job: step.Job) -> None:
     path, mark = job.final.avatar.parent / "checkpoints" / "last.pt", checkpoint.fingerprint(job)
     state = checkpoint.resume(job, path, mark, learner.avatar, learner.optimiser)
     loop(job, learner, data, state, path, mark)
-    checkpoint.write(job.output.avatar, build.content(learner.avatar, learner.settings(), data.head))
+    checkpoint.write(job.output.avatar, build.content(learner.avatar, build.settings_of(job.config), data.head))
     lines = ["step\tseconds\tloss\tprobe_psnr", *("\t".join(f"{value:.6g}" for value in row) for row in state.curve)]
     job.output.curve.write_text("\n".join(lines) + "\n", encoding="utf-8")
     job.write_json(

@@ -9,8 +9,10 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
-# Several test files run beside each other's steps on few cores: one BLAS thread each unless a test asks for more.
+# Several test files run beside each other's steps on few cores: one BLAS thread each unless a test asks for more. numba's too:
+# its parallel loops would set OpenMP's count, and so PyTorch's, for whatever test comes next.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 
 @pytest.fixture(scope="session")

@@ -62,7 +62,7 @@ class Sums:
     def disagreement(self) -> np.ndarray:
         """Variance of the colour over frames [side, side], averaged over the neighbourhood; infinite where nothing is seen."""
         square = np.square(self.colour).sum(1) / np.maximum(self.weight, 1e-6)
-        spread, weight = ((one).reshape(self.side, self.side) for one in (self.squared - square, self.weight))
+        spread, weight = (one.reshape(self.side, self.side) for one in (self.squared - square, self.weight))
         spread, weight = (ndimage.gaussian_filter(one, AGREEING) for one in (spread, weight))
         return np.where(weight > 1e-3, spread / np.maximum(weight, 1e-3), np.inf)
 
@@ -155,8 +155,8 @@ def components(found: list[Sums], bases: int, importance: np.ndarray) -> np.ndar
 
     importance: [s, s] of each texel's variance.
     """
-    colours = np.stack([logit(one.mean()[0], LIMIT) for one in found])  # [T, s, s, 3]
-    known = np.stack([one.mean()[1] for one in found])
+    means = [one.mean() for one in found]
+    colours, known = np.stack([logit(mean, LIMIT) for mean, _ in means]), np.stack([seen for _, seen in means])  # [T, s, s, 3]
     often = known.mean(0) > COMMON
     share = np.maximum(known.sum(0), 1)[..., None]
     residual = np.where(known[..., None], colours - (colours * known[..., None]).sum(0) / share, 0)

@@ -1,6 +1,6 @@
 """What trains each kind of avatar, one module each, behind one small interface; `avatar.train` has the loop.
 
-A module offers `learner(job, data) -> Learner`.
+A module offers `learner(job, data) -> Learner`; it is a part of the step and may read the step's inputs.
 """
 
 from __future__ import annotations
@@ -58,9 +58,6 @@ class Learner(Protocol):
 
     def precision(self) -> torch.dtype:
         """What large products are computed in."""
-
-    def settings(self) -> dict:
-        """What an avatar file must carry to build the avatar again."""
 
 
 def measured_shell(data: Data) -> np.ndarray:

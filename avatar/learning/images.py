@@ -156,10 +156,6 @@ class ImageLearner:
         """Of the perceptual network."""
         return self.perceptual.precision
 
-    def settings(self) -> dict:
-        """The part of the training config that an avatar file must carry."""
-        return build.settings_of(self.config)
-
 
 def learner(job: step.Job, data: Data) -> ImageLearner:
     """What trains a layered avatar."""

@@ -126,10 +126,6 @@ class RayLearner:
         """Of the matrix products."""
         return best_precision(self.device)
 
-    def settings(self) -> dict:
-        """The part of the training config that an avatar file must carry."""
-        return build.settings_of(self.config)
-
 
 def learner(job: step.Job, data: Data) -> RayLearner:
     """What trains a radiance field."""
