@@ -11,9 +11,7 @@ from avatar.networks import MLP, encoded_size, linear_in, positional_encoding
 
 HEAD_SIZE_M = 0.15  # offsets are divided by it before encoding
 NEAREST_M = 1e-8  # distances below the rounding of coordinates in metres count as this
-# Samples are padded to a multiple: oneDNN keeps a compiled product for each of the last 1024 shapes, and no two steps of training
-# have as many samples (nerface.mp4: 2.5 GB after 160 steps and 7.7 after 6,000, growing).
-ROWS = 512
+ROWS = 512  # samples are padded to a multiple, for what `field_kernel.ROWS` says
 DENSITY_LENGTH_M = 0.003  # a density of 1 is an optical depth of 1 over this length
 
 

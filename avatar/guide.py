@@ -47,8 +47,13 @@ def seen_density(
     return density, evaluations
 
 
-def guided(grid: shell.Grid, density: np.ndarray, rays: Rays, step_m: float, most: int, end: float) -> shell.Samples:
-    """Samples of each ray over the cells of the shell that hold its light or lie beside those.
+def guided(
+    grid: shell.Grid, density: np.ndarray, rays: Rays, step_m: float, most: int, end: float
+) -> tuple[shell.Samples, np.ndarray]:
+    """Samples of each ray over the cells of the shell that hold its light or lie beside those, and where [N] m they stop.
+
+    They stop before the shell does where the densities say that light has ended. A voxel's centre may know less than the ray:
+    what light is left there by the samples themselves goes on. Infinite where the shell or, at the core, the ray ends.
 
     density: from `seen_density`; step_m: length for one sample, most: samples on a ray, at least LEAST of it on each.
     A sample stands for the length of shell around it, halfway in weight to its neighbours; the last one of a ray that the core
@@ -58,9 +63,9 @@ def guided(grid: shell.Grid, density: np.ndarray, rays: Rays, step_m: float, mos
     distance, step = np.empty(size, np.float32), np.empty(size, np.float32)
     ray, slot, closed = np.empty(size, np.int64), np.empty(size, np.int64), np.zeros(size, bool)
     origins, directions = np.asarray(rays.origins_m, np.float64) - grid.origin, np.asarray(rays.directions, np.float64)
-    arrays = distance, step, ray, slot, closed
-    count = _guide(grid.labels, shell.VOXEL_M, origins, directions, density, step_m, least, most, end, *arrays)
-    return shell.Samples(*(array[:count].copy() for array in arrays))
+    arrays, stops = (distance, step, ray, slot, closed), np.full(len(origins), np.inf)
+    count = _guide(grid.labels, shell.VOXEL_M, origins, directions, density, step_m, least, most, end, *arrays, stops)
+    return shell.Samples(*(array[:count].copy() for array in arrays)), stops
 
 
 @numba.njit(cache=True)
@@ -84,14 +89,16 @@ def _look(labels, voxel, origins, directions, density, end, ahead, wanted, waiti
 
 @numba.njit(cache=True)
 def _guide(
-    labels, voxel, origins, directions, density, step_m, least, most, end, distance, step, ray, slot, closed
+    labels, voxel, origins, directions, density, step_m, least, most, end, distance, step, ray, slot, closed, stops
 ):  # fmt: skip # noqa: ANN001, ANN202
     start, stop, place = shell.room(labels.shape)
     weight, share, flat = np.empty(len(start)), np.empty(len(start)), density.reshape(-1)
     at = 0
     for n in range(len(origins)):
         count, met = shell.cells(labels, voxel, origins[n], directions[n], np.inf, start, stop, place)
-        count = _shares(met, count, start, stop, place, flat, end, weight, share)
+        count, stopped = _shares(met, count, start, stop, place, flat, end, weight, share)
+        if not met:
+            stops[n] = stopped
         if not count:
             continue
         kept = 0.0
@@ -119,8 +126,11 @@ def _guide(
 
 @numba.njit(cache=True)
 def _shares(met, count, start, stop, place, flat, end, weight, share):  # noqa: ANN001, ANN202
-    """Keeps a ray's cells that hold light or lie beside such, in place, with the share of its samples; returns their number."""
-    light, beyond, lit = 1.0, 0, 0
+    """Keeps a ray's cells that hold light or lie beside such, in place, with the share of its samples.
+
+    Returns their number and where they stop.
+    """
+    light, beyond, lit, stopped = 1.0, 0, 0, np.inf
     for i in range(count):
         density = flat[place[i]]
         through = np.exp(-density * (stop[i] - start[i])) if density >= 0 else 1.0
@@ -130,6 +140,8 @@ def _shares(met, count, start, stop, place, flat, end, weight, share):  # noqa: 
         if light < end:
             beyond += 1
         if beyond == 2:  # one more than the cell in which light ended: its centre may lie behind the surface
+            if lit < count:
+                stopped = stop[i]
             break
     if met and lit and beyond < 2:
         weight[lit - 1] += light  # the core ends it
@@ -145,4 +157,4 @@ def _shares(met, count, start, stop, place, flat, end, weight, share):  # noqa: 
             whole, total, kept = whole + stop[i] - start[i], total + widest, kept + 1
     for i in range(kept):
         share[i] = (1 - EVEN) * share[i] / total + EVEN * (stop[i] - start[i]) / whole
-    return kept
+    return kept, stopped

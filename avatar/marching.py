@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avatar import guide, shell
+from avatar import guide, sampling, shell
 from avatar.volume import CLOSED, Rays, Rendered, composite
 
 if TYPE_CHECKING:
@@ -64,20 +64,33 @@ class Marcher:
     precision: torch.dtype
 
     def render(self, density: np.ndarray, rays: Rays) -> tuple[Rendered, int]:
-        """N rays inside the shell, and the number of field evaluations; density: from `guide.seen_density`."""
-        samples = guide.guided(self.posed.grids[0], density, rays, self.avatar.step_m, self.most, END)
-        found = self.at(rays, samples, np.arange(len(samples.ray)))
-        return composited(samples, *found, len(rays.origins_m))[0], len(samples.ray)
+        """N rays inside the shell, and the number of field evaluations; density: from `guide.seen_density`.
+
+        A ray that has light left where its samples stop goes on through the rest of the shell.
+        """
+        grid, step_m = self.posed.grids[0], self.avatar.step_m
+        samples, stops = guide.guided(grid, density, rays, step_m, self.most, END)
+        front = composited(samples, *self.at(rays, samples), len(rays.origins_m))[0]
+        left = np.flatnonzero(np.isfinite(stops) & (1 - front.opacity.cpu().numpy() > END))
+        if not len(left):
+            return front, len(samples.ray)
+        on, stops = Rays(rays.origins_m[left], rays.directions[left]), stops[left].astype(np.float32)
+        rest = sampling.in_shell(
+            grid, on._replace(origins_m=on.origins_m + stops[:, None] * on.directions), step_m, self.most, None
+        )
+        rest = rest._replace(distance_m=rest.distance_m + stops[rest.ray])
+        behind = composited(rest, *self.at(on, rest), len(left))[0]
+        return joined(front, behind, torch.from_numpy(left).to(front.opacity.device)), len(samples.ray) + len(rest.ray)
 
     @property
     def most(self) -> int:
         """Samples on a ray: fewer than where they are spread over the whole shell."""
         return max(1, round(self.avatar.max_samples * GUIDED))
 
-    def at(self, rays: Rays, samples: shell.Samples, chosen: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Density and colour at some samples of the rays."""
-        directions = rays.directions[samples.ray[chosen]]
-        return self.evaluate(rays.origins_m[samples.ray[chosen]] + samples.distance_m[chosen, None] * directions, directions)
+    def at(self, rays: Rays, samples: shell.Samples) -> tuple[Tensor, Tensor]:
+        """Density and colour at samples of the rays."""
+        directions = rays.directions[samples.ray]
+        return self.evaluate(rays.origins_m[samples.ray] + samples.distance_m[:, None] * directions, directions)
 
     def evaluate(self, points_m: np.ndarray, directions: np.ndarray) -> tuple[Tensor, Tensor]:
         """The field at points [P, 3] seen along directions [P, 3]."""
@@ -101,3 +114,16 @@ def composited(samples: shell.Samples, density: Tensor, colour: Tensor, rays: in
     """Rays of one head from the field's values at its samples, and the weight of each sample."""
     distance, step, ray, slot, closed = (torch.from_numpy(array).to(density.device) for array in samples)
     return composite(density * step + CLOSED * closed, colour, distance, ray, slot, rays)
+
+
+def joined(front: Rendered, behind: Rendered, places: Tensor) -> Rendered:
+    """Rays of which those at `places` [M] go on; behind: [M], seen from where the front ones end, on the same background of 1."""
+    light = 1 - front.opacity[places]
+    opacity = 1 - light * (1 - behind.opacity)
+    depth = front.depth[places] * front.opacity[places] + light * behind.opacity * behind.depth
+    parts = (
+        front.colour[places] + light[:, None] * (behind.colour - 1),
+        opacity,
+        depth / torch.where(opacity > 0, opacity, torch.ones_like(opacity)),
+    )
+    return Rendered(*(whole.index_copy(0, places, part) for whole, part in zip(front, parts, strict=True)))

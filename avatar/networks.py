@@ -109,6 +109,23 @@ def decode(maps: Tensor, enlarge: nn.ModuleList, merge: nn.ModuleList, skips: li
     return maps
 
 
+def keep_size(module: nn.Module) -> None:
+    """Start a convolution with weights that keep a signal's size from layer to layer and a bias of zero; for `Module.apply`.
+
+    PyTorch's own start shrinks the signal with each convolution and adds random constants: after 17 of them the maps are the same
+    for every frame (nerface.mp4: features of 0.07 whose standard deviation over 15 frames is 0.0002, with this one 0.14).
+    """
+    if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
+        nn.init.kaiming_normal_(module.weight, SLOPE, "fan_out" if isinstance(module, nn.ConvTranspose2d) else "fan_in")
+        nn.init.zeros_(module.bias)
+    if isinstance(module, nn.ConvTranspose2d):  # stride 2: each output is a sum over a quarter of the kernel
+        with torch.no_grad():
+            module.weight.mul_(2)
+    if isinstance(module, ResidualBlock):
+        with torch.no_grad():  # the block's two paths are added
+            module.second.weight.mul_(0.7)
+
+
 class UNet(nn.Module):
     """The 6-level residual U-Net of supplement B: down 8..256, up 128, 64, 64, ... with transposed convolutions.
 
@@ -124,6 +141,7 @@ class UNet(nn.Module):
         self.down = nn.ModuleList(ResidualBlock(down[i], down[i + 1], 2) for i in range(len(levels)))
         self.up, self.merge = enlarging_blocks(levels[-1], [*reversed(levels[:-1]), 0])
         self.out = nn.Conv2d(self.up[-1].out_channels, after, 1)
+        self.apply(keep_size)
         self.precision = torch.float32  # of training's convolutions; see `train_in`
 
     def forward(self, maps: Tensor) -> Tensor:

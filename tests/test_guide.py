@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 
 from avatar import guide, sampling, shell
+from avatar.marching import Marcher
 from avatar.volume import Rays
 
 FULL = 500.0  # optical depth 2 across a voxel
@@ -49,9 +53,9 @@ def crossed(grid: shell.Grid, origin: np.ndarray, direction: np.ndarray) -> tupl
 
 
 def twin(grid: shell.Grid, density: np.ndarray, origin: np.ndarray, direction: np.ndarray, step: float, most: int, end: float):
-    """Distances and steps of one ray in float64, cumulative shares inverted by interpolation; and whether it is closed."""
+    """Distances and steps of one ray in float64, cumulative shares inverted; whether it is closed, and where it stops."""
     cells, met = crossed(grid, origin.astype(np.float64), direction.astype(np.float64))
-    light, beyond, weights = 1.0, 0, []
+    light, beyond, weights, stopped = 1.0, 0, [], np.inf
     for enter, leave, place in cells:
         known = density[place] >= 0
         through = np.exp(-float(density[place]) * (leave - enter)) if known else 1.0
@@ -59,13 +63,14 @@ def twin(grid: shell.Grid, density: np.ndarray, origin: np.ndarray, direction: n
         light *= through
         beyond += light < end
         if beyond == 2:
+            stopped = leave if len(weights) < len(cells) and not met else np.inf
             break
     if met and weights and beyond < 2:
         weights[-1] += light
     widest = [max(weights[max(i - 1, 0) : i + 2]) for i in range(len(weights))]
     kept = [(cell, w) for cell, w in zip(cells, widest, strict=False) if w > guide.FAINT]
     if not kept:
-        return np.zeros(0), np.zeros(0), False
+        return np.zeros(0), np.zeros(0), False, stopped
     length = np.array([leave - enter for (enter, leave, _), _ in kept])
     share = np.array([w for _, w in kept])
     share = (1 - guide.EVEN) * share / share.sum() + guide.EVEN * length / length.sum()
@@ -74,17 +79,18 @@ def twin(grid: shell.Grid, density: np.ndarray, origin: np.ndarray, direction: n
     edges = np.interp(np.arange(number + 1) / number, passed, run)
     middles = np.interp((np.arange(number) + 0.5) / number, passed, run)
     cell = np.clip(np.searchsorted(run, middles) - 1, 0, len(kept) - 1)
-    return np.array([kept[c][0][0] + m - run[c] for c, m in zip(cell, middles, strict=True)]), np.diff(edges), met
+    return np.array([kept[c][0][0] + m - run[c] for c, m in zip(cell, middles, strict=True)]), np.diff(edges), met, stopped
 
 
 @pytest.mark.parametrize(("step", "most", "end"), [(0.001, 16, 0.004), (0.004, 5, 0.0), (0.1, 1, 0.3)])
 def test_guided_samples_equal_a_loop_over_every_voxel(step: float, most: int, end: float) -> None:
     grid, density = grid_of(1)
     rays = rays_through(grid, 60, 2)
-    samples = guide.guided(grid, density, rays, step, most, end)
+    samples, stops = guide.guided(grid, density, rays, step, most, end)
     hit = 0
     for n in range(60):
-        distance, stretch, met = twin(grid, density, rays.origins_m[n], rays.directions[n], step, most, end)
+        distance, stretch, met, stopped = twin(grid, density, rays.origins_m[n], rays.directions[n], step, most, end)
+        assert stops[n] == pytest.approx(stopped, abs=1e-6)
         mine = samples.ray == n
         np.testing.assert_allclose(samples.distance_m[mine], distance, atol=1e-6)
         np.testing.assert_allclose(samples.step_m[mine], stretch, atol=1e-6)
@@ -110,10 +116,23 @@ def test_only_voxels_that_light_reaches_are_evaluated(monkeypatch: pytest.Monkey
     assert evaluations == len(asked) == len(set(asked)) and all(grid.labels[place] == shell.SHELL for place in asked)
     known = found >= 0
     assert (found[known] == density[known]).all() and (grid.labels == shell.SHELL).sum() > evaluations
-    unbounded = guide.guided(grid, np.where(grid.labels == shell.SHELL, density, guide.UNKNOWN), rays, 0.001, 8, 0.004)
-    lazy = guide.guided(grid, found, rays, 0.001, 8, 0.004)
+    unbounded = guide.guided(grid, np.where(grid.labels == shell.SHELL, density, guide.UNKNOWN), rays, 0.001, 8, 0.004)[0]
+    lazy = guide.guided(grid, found, rays, 0.001, 8, 0.004)[0]
     for one, other in zip(lazy, unbounded, strict=True):  # no ray needs a voxel that was not asked for
         np.testing.assert_array_equal(one, other)
+
+
+def test_where_samples_stop_before_the_shell_does() -> None:
+    labels = np.full((3, 1, 12), shell.SHELL, np.uint8)
+    labels[1, 0, 10], labels[2, 0, 7:] = shell.CORE, shell.EMPTY
+    density = np.zeros(labels.shape, np.float32)
+    density[:, 0, 5] = 4 * FULL
+    rays = Rays(
+        np.array([[0.002, 0.002, -1], [0.006, 0.002, -1], [0.01, 0.002, -1]], np.float32), np.array([[0, 0, 1]] * 3, np.float32)
+    )
+    samples, stops = guide.guided(shell.Grid(np.zeros(3), labels), density, rays, 0.001, 8, 0.004)
+    assert stops == pytest.approx([1 + 7 * shell.VOXEL_M, np.inf, np.inf])  # more shell behind, the core, the shell's end
+    assert samples.distance_m[samples.ray == 0].max() < stops[0] and samples.closed[samples.ray == 1][-1]
 
 
 def test_lone_voxels_and_their_neighbours_are_sampled_and_clear_air_is_not() -> None:
@@ -122,11 +141,11 @@ def test_lone_voxels_and_their_neighbours_are_sampled_and_clear_air_is_not() -> 
     density[0, 0, 20] = 1.0  # an optical depth of 0.004
     grid = shell.Grid(np.zeros(3), labels)
     rays = Rays(np.array([[0.002, 0.002, -1]], np.float32), np.array([[0, 0, 1]], np.float32))
-    samples = guide.guided(grid, density, rays, 0.001, 64, 0.004)
+    samples = guide.guided(grid, density, rays, 0.001, 64, 0.004)[0]
     inside = samples.distance_m - 1
     assert samples.step_m.sum() == pytest.approx(3 * shell.VOXEL_M, rel=1e-4)
     assert 19 * shell.VOXEL_M < inside.min() < inside.max() < 22 * shell.VOXEL_M
-    assert not len(guide.guided(grid, np.zeros_like(density), rays, 0.001, 64, 0.004).ray)
+    assert not len(guide.guided(grid, np.zeros_like(density), rays, 0.001, 64, 0.004)[0].ray)
 
 
 def test_a_smooth_surface_is_integrated_as_by_many_even_samples() -> None:
@@ -150,7 +169,7 @@ def test_a_smooth_surface_is_integrated_as_by_many_even_samples() -> None:
 
     found, count, _ = shell.intervals(grid, rays.origins_m, rays.directions)
     exact = picture(shell.sample(found, count, 1e-5, 4000, None))
-    quick = picture(guide.guided(grid, guide.seen_density(grid, rays, density_at, 0.004)[0], rays, 0.001, 12, 0.004))
+    quick = picture(guide.guided(grid, guide.seen_density(grid, rays, density_at, 0.004)[0], rays, 0.001, 12, 0.004)[0])
     assert exact[0].max() > 0.99 and np.abs(quick[0] - exact[0]).max() < 0.02
     full = exact[0] > 0.99
     assert np.abs(quick[1] - exact[1])[full].mean() < 2e-4
@@ -160,8 +179,35 @@ def test_no_rays_and_no_shell() -> None:
     grid, density = grid_of(6)
     none = Rays(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
     assert guide.seen_density(grid, none, lambda points: points[:, 0], 0.004)[1] == 0
-    assert not len(guide.guided(grid, density, none, 0.001, 8, 0.004).ray)
+    assert not len(guide.guided(grid, density, none, 0.001, 8, 0.004)[0].ray)
     empty = shell.Grid(np.zeros(3), np.zeros((1, 1, 1), np.uint8))
     rays = rays_through(grid, 5, 0)
     assert guide.seen_density(empty, rays, lambda points: points[:, 0], 0.004)[1] == 0
-    assert not len(guide.guided(empty, np.zeros((1, 1, 1), np.float32), rays, 0.001, 8, 0.004).ray)
+    assert not len(guide.guided(empty, np.zeros((1, 1, 1), np.float32), rays, 0.001, 8, 0.004)[0].ray)
+
+
+def test_light_that_is_left_where_samples_stop_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Voxel centres see an opaque fence through which the rays pass: what stands behind it is drawn all the same, and once."""
+    labels = np.full((2, 1, 40), shell.SHELL, np.uint8)
+    rays = Rays(np.array([[0.001, 0.002, -1], [0.006, 0.002, -1]], np.float32), np.array([[0, 0, 1]] * 2, np.float32))
+
+    def evaluate(_: Marcher, points: np.ndarray, directions: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        fence = (np.abs(points[:, 0] % shell.VOXEL_M - 0.002) < 0.0005) & (points[:, 2] > 0.03) & (points[:, 2] < 0.05)
+        haze, wall = 20.0 * (points[:, 2] < 0.08), points[:, 2] > 0.1
+        colour = np.where(wall[:, None], (0.0, 0.5, 1.0), 0.25).astype(np.float32)
+        return torch.from_numpy((1e4 * fence + haze + 300 * wall).astype(np.float32)), torch.from_numpy(colour)
+
+    monkeypatch.setattr(Marcher, "evaluate", evaluate)
+    avatar, posed = SimpleNamespace(step_m=0.0005, max_samples=600), SimpleNamespace(grids=[shell.Grid(np.zeros(3), labels)])
+    marcher = Marcher(avatar, posed, torch.zeros(1, 1), torch.float32)
+    found, evaluations = marcher.render(marcher.seen(rays)[0], rays)
+    hidden, light = np.exp(-20 * 0.08), np.exp(-20 * 0.08 - 300 * 0.06)
+    colour = (1 - hidden) * 0.25 + (hidden - light) * np.array([0, 0.5, 1]) + light
+    assert found.opacity[0].item() == pytest.approx(1 - light, abs=1e-3) and found.opacity[1].item() == pytest.approx(1, abs=1e-3)
+    np.testing.assert_allclose(found.colour[0], colour, atol=0.02)
+    np.testing.assert_allclose(found.colour[1], 0.25, atol=0.02)
+    along = np.arange(0.00005, 0.16, 0.0001)
+    tau = np.where(along < 0.08, 20, np.where(along > 0.1, 300, 0)) * 0.0001
+    weight = np.exp(-np.concatenate([[0], np.cumsum(tau)[:-1]])) * (1 - np.exp(-tau))
+    assert found.depth[0].item() == pytest.approx(1 + (weight * along).sum() / weight.sum(), abs=1e-3)
+    assert evaluations < 400 * 2

@@ -17,6 +17,7 @@ from avatar.networks import (
     decode,
     encoded_size,
     enlarging_blocks,
+    keep_size,
     linear_in,
     positional_encoding,
     train_in,
@@ -69,6 +70,21 @@ def test_unet_keeps_the_resolution_and_uses_every_parameter(size: int) -> None:
     assert result.shape == (2, 64, size, size)
     result.square().mean().backward()
     assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in network.parameters())
+
+
+def test_a_new_unet_keeps_the_size_of_what_it_reads() -> None:
+    """Maps of two frames differ as much as the frames do: with PyTorch's own start by a thousandth of it."""
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for size in (0.01, 1.0):
+            frames = nn.functional.interpolate(size * torch.randn(4, 3, 4, 4), (64, 64), mode="bicubic")
+            maps = UNet(3, 64)(frames)
+            assert 0.3 < maps.std(0).mean() / frames.std(0).mean() < 3 and maps.std(0).mean() > 0.3 * maps.square().mean().sqrt()
+        assert not UNet(3, 64)(torch.zeros(1, 3, 64, 64)).any()  # biases of zero
+        block = ResidualBlock(64, 64)
+        rows, before = torch.randn(8, 64, 16, 16), block.second.weight.clone()
+        assert not torch.equal(block.apply(keep_size).second.weight, before)
+        assert 0.6 < block(rows).square().mean().sqrt() < 1.7
 
 
 def test_unet_has_the_papers_channels() -> None:

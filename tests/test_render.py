@@ -44,6 +44,7 @@ def test_marching_in_blocks_equals_one_pass_over_all_samples(trained: dict[str, 
     torch.testing.assert_close(blocks.depth[seen], whole.depth[seen], atol=2e-5, rtol=1e-4)
     monkeypatch.undo()
     quick, fewer = avatar.march(posed, rays, torch.float32)
+    torch.testing.assert_close(quick.colour, marched_in_one_pass(avatar, posed, rays).colour, atol=2e-5, rtol=1e-4)
     assert fewer <= evaluations and (quick.colour - whole.colour).abs().mean() < 0.01
     missing = (whole.opacity == 0).numpy()
     assert missing.any() and (quick.colour[missing] == 1).all()

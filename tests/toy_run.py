@@ -82,6 +82,17 @@ def marched_in_one_pass(avatar: RadianceAvatar, posed: Posed, rays: Rays) -> Ren
     density = np.full(grid.labels.shape, guide.UNKNOWN)
     with torch.no_grad():
         density[tuple(place.T)] = seen(centres, np.zeros_like(centres))[0].numpy()
-        samples = guide.guided(grid, density, rays, avatar.step_m, most, marching.END)
-        packed = sampling.pack(rays, samples)
-        return marching.composited(samples, *seen(packed.points_m, packed.directions), len(rays.origins_m))[0]
+        samples, stops = guide.guided(grid, density, rays, avatar.step_m, most, marching.END)
+
+        def drawn(samples: shell.Samples) -> Rendered:
+            packed = sampling.pack(rays, samples)
+            return marching.composited(samples, *seen(packed.points_m, packed.directions), len(rays.origins_m))[0]
+
+        left = np.isfinite(stops) & (1 - drawn(samples).opacity.numpy() > marching.END)
+        later = rays.origins_m + np.where(left, stops, 0)[:, None].astype(np.float32) * rays.directions
+        rest = sampling.in_shell(grid, Rays(later, rays.directions), avatar.step_m, most, None)
+        rest = shell.Samples(*(array[left[rest.ray]] for array in rest))
+        rest = rest._replace(distance_m=rest.distance_m + stops[rest.ray].astype(np.float32), slot=rest.slot + most)
+        both = [np.concatenate(pair) for pair in zip(samples, rest, strict=True)]
+        order = np.lexsort((both[3], both[2]))
+        return drawn(shell.Samples(*(array[order] for array in both)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -47,5 +46,5 @@ def ended(posed: Posed, rays: Rays, samples: shell.Samples) -> shell.Samples:
 
 def seen(marcher: Marcher, rays: Rays, samples: shell.Samples) -> tuple[Rendered, Tensor]:
     """N rays, and the weight [P] of every sample, none left out."""
-    density, colour = marcher.at(rays, samples, np.arange(len(samples.ray)))
+    density, colour = marcher.at(rays, samples)
     return composited(samples, density, colour, len(rays.origins_m))
