@@ -70,12 +70,11 @@ def ball(vertices_m: np.ndarray) -> tuple[np.ndarray, float]:
     return centre, float(np.linalg.norm(within - centre, axis=1).max() + MARGIN_M)
 
 
-def outside(grid: shell.Grid, vertices_m: np.ndarray, thickness_m: np.ndarray, numbers: np.ndarray, head: int = 0) -> Packed:
+def outside(grid: shell.Grid, vertices_m: np.ndarray, numbers: np.ndarray, head: int = 0) -> Packed:
     """Points of the sphere of `bounds` that lie neither in the shell nor in the core; on no ray: slot OUTSIDE_SLOT.
 
-    thickness_m: [V] of the shell; numbers: [M, 3] in [0, 1), for a point each: every second is spread evenly over the sphere,
-    the others lie up to BESIDE_M beyond the shell, most of them close to it, where the field has most to forget. They are seen
-    along no direction.
+    numbers: [M, 3] in [0, 1), for a point each: every second is spread evenly over the sphere, the others lie up to BESIDE_M
+    from a vertex, where the field has most to forget. They are seen along no direction.
     """
     centre, radius = ball(vertices_m)
     height, turn = 2 * numbers[:, 1] - 1, 2 * np.pi * numbers[:, 2]

@@ -24,6 +24,7 @@ SKIN, AIR = 2.5, -4.0  # logits of opacity: of a surface, and of what lies befor
 MEDIAN = 9  # texels a side over which the surface's shell is the median
 AGREEING = 4.0  # texels over which the frames' agreement on a colour is averaged
 OUTSIDE = 2.0  # below what the matte's own mean says, beside the head
+CLEARER = 0.6  # part of the skin's disagreement below which another shell is taken for the surface of the face
 STANDS_OFF_M = 0.0045  # reach of the shells above which something stands off the mesh
 LIMIT = 0.02  # colours are kept this far from 0 and 1: their logits are finite
 DETAIL = 4  # the principal components are found at a texture's side over this
@@ -101,6 +102,18 @@ def gathered(
     return sums, singles
 
 
+def _nearest(avatar: LayeredAvatar, disagreement: np.ndarray) -> np.ndarray:
+    """The shell [side, side] on whose colours frames agree best, of those above the skin or a few more [n, side, side].
+
+    Over the face it is the skin's, unless another is CLEARER: what frames disagree on there is mostly what expressions change.
+    """
+    skin, side = len(avatar.textures) - 3, disagreement.shape[1]
+    face = (avatar.head.region == REGIONS.index("face")).float().cpu().numpy()
+    least = np.where(_map_of(avatar, face, "skin", side) > 0.5, CLEARER, 1.0)
+    best = np.where(disagreement.min(0) < least * disagreement[skin], disagreement.argmin(0), skin)
+    return ndimage.median_filter(best, MEDIAN)
+
+
 def settle(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.ndarray, chosen: Sequence[int]) -> None:
     """Move the shells to the surface of what stands off the skin, in place: a plane sweep (Collins, 1996), shells as planes.
 
@@ -109,7 +122,7 @@ def settle(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.nd
     shown = range(len(avatar.textures) - 2)
     sums = gathered(avatar, scene, frames, alpha, chosen, shown)[0]
     disagreement = np.stack([sums[layer].disagreement() for layer in shown])
-    best = ndimage.median_filter(disagreement.argmin(0), MEDIAN)
+    best = _nearest(avatar, disagreement)
     side, uv = avatar.textures.shape[1], avatar.corner_uv[avatar.drawn[0]].reshape(-1, 2)
     column, row = (np.clip((place * side).astype(int), 0, side - 1) for place in (uv[:, 0], 1 - uv[:, 1]))
     vertex = avatar.triangles[avatar.drawn[0]].ravel()
@@ -128,7 +141,7 @@ def project(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.n
     stands_off = _map_of(avatar, avatar.offsets_m[0].cpu().numpy(), "skin", side) > STANDS_OFF_M
     disagreement = np.stack([sums[layer].disagreement() for layer in range(layers - 1)])
     # Where something stands off, the surface is the shell on whose colours the frames agree best; else the skin.
-    nearest = ndimage.median_filter(disagreement.argmin(0), MEDIAN)
+    nearest = _nearest(avatar, disagreement)
     nearest = np.where(stands_off & np.isfinite(disagreement).any(0), nearest, layers - 3)
     region = avatar.head.region.cpu().numpy()
     expressive = np.where(np.isin(region, [REGIONS.index(name) for name in EXPRESSIVE]), 1.0, OTHERS)

@@ -17,18 +17,20 @@ from avatar.features import Condition
 from avatar.layered import composite, packing, raster, shells
 from avatar.layered.layout import layout
 from avatar.layered.raster import Fragments
-from avatar.networks import SLOPE, ResidualBlock, UNet
+from avatar.networks import UNet
 from avatar.uv import rasterise
 from avatar.view import View
 from avatar.volume import Rendered
 from fitting.head_model import HeadModel
 from fitting.raster import vertex_normals
 
-FADE, ASIDE = 8.0, 0.5  # logits of opacity that a shell loses when seen edge on, and the cosine from which it does
+FADE, ASIDE = 8.0, 0.5  # logits of opacity that a shell loses at first when seen edge on, and the cosine from which it does
+FADING = 10.0  # how much faster than the networks each place learns whether it does
 LARGEST_MOVE = 0.03  # of a fetch in UV: what tracking and shape are wrong by, never another part of the face
 MOVES_M = 0.003  # expressions move the skin by millimetres: inputs of about one
 WIDTH = 64  # channels of the U-Net's output
 START = 0.02  # standard deviation of the output layer's weights: at the start the static texture is all there is
+LEARNED = ("unet.", "out.", "fading")  # entries of the state that a file holds as the networks'
 BASIS_START = 0.01  # of the bases: a basis of zeros would never get a gradient, nor its weight
 
 
@@ -39,23 +41,6 @@ class Posed:
     layers_m: np.ndarray  # [L, V, 3] float32, where each layer's vertices are
     normals: np.ndarray  # [V, 3] float32
     condition: Condition
-
-
-def _begin(module: nn.Module) -> None:
-    """Weights that keep a signal's size from layer to layer, and biases of zero.
-
-    PyTorch's own start shrinks it with each convolution and adds random constants: after 17 of them the maps are the same for
-    every frame (nerface.mp4, 1,500 steps: their standard deviation over frames was a tenth of their mean).
-    """
-    if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
-        nn.init.kaiming_normal_(module.weight, SLOPE, "fan_out" if isinstance(module, nn.ConvTranspose2d) else "fan_in")
-        nn.init.zeros_(module.bias)
-    if isinstance(module, nn.ConvTranspose2d):  # stride 2: each output is a sum over a quarter of the kernel
-        with torch.no_grad():
-            module.weight.mul_(2)
-    if isinstance(module, ResidualBlock):
-        with torch.no_grad():  # the block's two paths are added
-            module.second.weight.mul_(0.7)
 
 
 class LayeredAvatar(nn.Module):
@@ -74,14 +59,14 @@ class LayeredAvatar(nn.Module):
             corners, barycentric = self._map_of(part, settings["uv_size"])
             self.register_buffer(f"{name}_corners", corners, persistent=False)  # [r, r, 3] vertices
             self.register_buffer(f"{name}_barycentric", barycentric, persistent=False)
-        self.register_buffer("stands_off", (torch.arange(count) < count - 2).float(), persistent=False)  # [L]
         self.register_buffer("thickness_m", torch.zeros(head.vertex_count))
         self.register_buffer("offsets_m", torch.zeros(count, head.vertex_count))
         textures = torch.zeros(count, side, side, composite.texture_channels(bases))
         textures[..., 4:] = torch.randn(textures[..., 4:].shape) * BASIS_START
         self.register_buffer("textures", textures)  # trained by `texel_adam`
+        # How much of FADE each place of each shell takes; learned, times FADING to be quick.
+        self.fading = nn.Parameter(torch.zeros(count - 2, settings["uv_size"], settings["uv_size"]))
         self.unet = UNet(9, WIDTH)
-        self.unet.apply(_begin)
         self.out = nn.Conv2d(WIDTH, count * composite.map_channels(bases), 1)
         nn.init.normal_(self.out.weight, std=START)
         nn.init.zeros_(self.out.bias)
@@ -112,7 +97,7 @@ class LayeredAvatar(nn.Module):
 
     def packed(self) -> dict:
         """What a file of this avatar holds, a few megabytes; see `avatar.layered.packing`."""
-        networks = {name: value.bfloat16() for name, value in self.state_dict().items() if name.startswith(("unet.", "out."))}
+        networks = {name: value.bfloat16() for name, value in self.state_dict().items() if name.startswith(LEARNED)}
         return {
             "thickness_m": self.thickness_m,
             "offsets_m": self.offsets_m,
@@ -123,7 +108,7 @@ class LayeredAvatar(nn.Module):
     def unpack(self, stored: dict) -> None:
         """Take over what `packed` gave. Raises ValueError, RuntimeError or KeyError when it does not fit."""
         self.textures = packing.unpacked_textures(stored["textures"], tuple(self.textures.shape)).to(self.textures.device)
-        networks = {name for name in self.state_dict() if name.startswith(("unet.", "out."))}
+        networks = {name for name in self.state_dict() if name.startswith(LEARNED)}
         if networks != set(stored["networks"]):
             raise KeyError(f"the file's network has other layers: {sorted(networks ^ set(stored['networks']))[:3]}")
         self.load_state_dict(self.state_dict() | {name: value.float() for name, value in stored["networks"].items()})
@@ -156,12 +141,14 @@ class LayeredAvatar(nn.Module):
         """A frame's maps [L, r, r, D], with gradients; told: instead of the frame's own.
 
         Shells that stand off the skin fade out where they are seen from the side: their outlines would be hard edges in the air.
+        Where hair ends at the shell itself, as a place learns from the views that show it edge on, it stays.
         """
         told = self.told(posed, view) if told is None else told
         maps = self.out(self.unet(told[None, :-1])).unflatten(1, (self.count, -1))[0].permute(0, 2, 3, 1)
         move, colour, opacity, weights = maps.split([composite.MOVE, 3, 1, self.bases], -1)
         aside = 1 - torch.clamp(told[-1] / ASIDE, 0, 1)
-        fade = FADE * aside.square()[None, ..., None] * self.stands_off[:, None, None, None]
+        fade = FADE * aside.square() * torch.relu(1 + FADING * self.fading)
+        fade = torch.cat([fade, fade.new_zeros(self.count - len(fade), *fade.shape[1:])])[..., None]
         return torch.cat([LARGEST_MOVE * torch.tanh(move), colour, opacity - fade, weights], -1)
 
     def fragments(self, posed: Posed, view: View) -> Fragments:

@@ -27,6 +27,7 @@ FACE_SHARE = 0.5  # of the windows are centred on a landmark, the others anywher
 SPREAD_PX = 15.0
 # Learning rates: of the networks, and of the textures' static logits and bases.
 NETWORK_RATE, STATIC_RATE, BASIS_RATE = 1e-3, 0.03, 0.02
+FINAL = 0.1
 WARM_UP = 100  # steps
 STIR = 0.1  # standard deviation of how far the network's input is moved towards another frame's
 PERCEPTUAL_FROM = 0.15  # of the steps: before, colours alone settle what moves, in steps of less time
@@ -90,7 +91,7 @@ class ImageLearner:
     def rates(self, number: int) -> None:
         """Exponential decay to a tenth, after a short linear rise."""
         factor = self.config.learning_rate / 1e-3  # the rates below are those at its default
-        factor *= 0.1 ** (number / self.config.steps) * min(1.0, (number + 1) / WARM_UP)
+        factor *= FINAL ** (number / self.config.steps) * min(1.0, (number + 1) / WARM_UP)
         for group in self.optimiser.networks.param_groups:
             group["lr"] = NETWORK_RATE * factor
         self.optimiser.texels.rates[:4], self.optimiser.texels.rates[4:] = STATIC_RATE * factor, BASIS_RATE * factor
