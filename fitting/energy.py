@@ -60,6 +60,10 @@ class Frame:
     gaze_mean: np.ndarray  # [4] where the gaze is held while an eye is shut
 
 
+SHUT_SIGMA = 0.25  # of the lid gap of a shut eye, which is surely none, over that of an open one
+# (nerface.mp4, lids shut: 6 px of gap before, 4 px with this and the stronger photometric term.)
+
+
 @dataclass(frozen=True)
 class Rows:
     """Residual rows of one term in one frame, weighted so that the cost is half their sum of squares to first order."""
@@ -112,10 +116,14 @@ def landmark_rows(model: LandmarkModel, frame: Frame, weights: Weights, lens: Ca
 
 
 def eyelid_rows(model: LandmarkModel, frame: Frame, weights: Weights, lens: Camera, at: Posed) -> Rows:
-    """Gap between the lids as seen against as detected: a blink moves few landmarks by little, so it gets its own term."""
+    """Gap between the lids as seen against as detected: a blink moves few landmarks by little, so it gets its own term.
+
+    Tightest where an eye is shut: an open eye's gap, held as tightly, would turn the head.
+    """
     upper, lower = model.lids[..., 0].ravel(), model.lids[..., 1].ravel()
     seen = np.sqrt(frame.weight[upper] * frame.weight[lower] * facing(model.surface.normal[upper], at.pose))
-    scale = seen / (weights.eyelid_sigma * frame.scale_px)
+    shut = 1 - np.repeat(frame.open_eyes, model.lids.shape[1])
+    scale = seen / (weights.eyelid_sigma * (1 - shut * (1 - SHUT_SIGMA)) * frame.scale_px)
     pixel = camera.project(at.points, lens.focal_px, lens.centre_px)
     gap = (pixel[upper] - pixel[lower]) - (frame.points[upper] - frame.points[lower])
     residual = gap * scale[:, None]

@@ -90,10 +90,11 @@ def fit_clip(clip: Clip, config: FitConfig, bar: Bar = lambda rows, _: rows, hel
         state, reinit = _track(clip, config, tracker, bar)
     looks: dict[int, Look] = {}
     if pictures is not None:
+        if config.weights.photometric:
+            with _timed(seconds, "appearance"):
+                _learn(clip, calibration.keyframes, tracker, pictures, state)
         with _timed(seconds, "pixels"):
-            if config.weights.photometric:
-                pictures.learn(calibration.keyframes, state.frames(calibration.keyframes), shared.lens(clip.observed.centre_px))
-            state, looks = _refine(clip, tracker, pictures, state, bar)
+            state, looks = _refine(clip, tracker, pictures, state, np.flatnonzero(found), bar)
     cut = bundle.cuts(state, found)
     before = state
     if config.weights.temporal:
@@ -117,10 +118,10 @@ def fit_clip(clip: Clip, config: FitConfig, bar: Bar = lambda rows, _: rows, hel
 
 @contextmanager
 def _timed(table: dict[str, float], name: str) -> Iterator[None]:
-    """Write the seconds of a block into a table."""
+    """Add the seconds of a block to a table."""
     start = time.perf_counter()
     yield
-    table[name] = time.perf_counter() - start
+    table[name] = table.get(name, 0.0) + time.perf_counter() - start
 
 
 def _solver(config: FitConfig) -> stages.Solve:
@@ -208,12 +209,22 @@ def _problem(
     return replace(problem, terms=(*problem.terms, *extra))
 
 
-def _refine(clip: Clip, tracker: stages.Tracker, pictures: Pictures, state: State, bar: Bar) -> tuple[State, dict[int, Look]]:
-    """Each frame again with its pixels, coarse level first; frames do not read each other."""
+def _learn(clip: Clip, keyframes: np.ndarray, tracker: stages.Tracker, pictures: Pictures, state: State) -> None:
+    """What skin and hair look like: from the keyframes as the landmarks place them, then from those as their pixels do."""
+    pictures.learn(keyframes, state.frames(keyframes), tracker.lens)
+    for _ in range(settings.APPEARANCE_ROUNDS - 1):
+        state, _ = _refine(clip, tracker, pictures, state, keyframes, lambda rows, _: rows)
+        pictures.learn(keyframes, state.frames(keyframes), tracker.lens)
+
+
+def _refine(
+    clip: Clip, tracker: stages.Tracker, pictures: Pictures, state: State, rows: np.ndarray, bar: Bar
+) -> tuple[State, dict[int, Look]]:
+    """Some frames again with their pixels, coarse level first; frames do not read each other."""
     poses = [state.pose(row) for row in range(len(state))]
     looks = {}
     levels = range(FINEST + 1) if pictures.appearance is not None else (FINEST,)
-    for row in bar(np.flatnonzero(clip.observed.found), "pixels"):
+    for row in bar(rows, "pixels"):
         looks[row] = pictures.look(row, poses[row], tracker.shared.shape, tracker.lens)
         for level in levels:
             problem = _problem(clip, tracker, pictures, looks[row], row, poses[row], level)
