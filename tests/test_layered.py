@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from toy_head import toy_head, toy_images, toy_track
 
 from avatar import build
@@ -160,9 +161,10 @@ def test_depth_is_the_ellipsoids_where_it_is_opaque(head: HeadModel, scene: Scen
 def test_a_file_draws_what_was_trained(head: HeadModel, scene: Scene) -> None:
     avatar = made(head)
     avatar.textures[...] += torch.randn(avatar.textures.shape)
+    avatar.fading.data += 0.1 * torch.randn(avatar.fading.shape)
     stored = build.content(avatar, SETTINGS, head)
     again = build.restore(stored, head)
-    assert torch.equal(again.offsets_m, avatar.offsets_m)
+    assert torch.equal(again.offsets_m, avatar.offsets_m) and torch.equal(again.fading, avatar.fading.bfloat16().float())
     pictures = [
         one.picture(one.pose(*scene.heads([0], "cpu")), scene.view(0, (SIZE, SIZE)), torch.float32)[0].colour
         for one in (avatar, again)
@@ -196,3 +198,25 @@ def test_the_maps_see_how_the_head_is_turned_and_shells_fade_at_their_rim(head: 
     assert front.shape == (5, 64, 64, 2 + 4 + 2) and (front - behind)[..., :5].abs().max() > 1e-5
     opacity = front[..., 5].detach()
     assert opacity[0].min() < -FADE * 0.9 and opacity[0].max() > -1 and opacity[-2:].min() > -4
+    with torch.no_grad():
+        avatar.fading[0, :, :32] = -1  # places of the outermost shell that have learned to stay
+    stays = avatar.maps(posed, view)[0, ..., 5].detach()
+    assert stays[:, :32].min() > -4 and torch.equal(stays[:, 32:], opacity[0, :, 32:]) and opacity[0, :, :32].min() < -4
+    avatar.fading.grad = None
+    avatar.maps(posed, view)[..., 5].sum().backward()
+    assert avatar.fading.grad[1:].abs().max() > 0  # and all others may learn it
+
+
+def test_over_the_face_another_shell_must_be_clearly_better_to_be_the_surface(head: HeadModel) -> None:
+    avatar = made(head)
+    skin, side = len(avatar.textures) - 3, avatar.textures.shape[1]
+    face = initial._map_of(avatar, (head.region == REGIONS.index("face")).double().numpy(), "skin", side) > 0.5
+    assert face.any() and not face.all()
+    for better, taken in ((0.9, skin), (0.5, 0)):
+        disagreement = np.ones((skin + 1, side, side))
+        disagreement[0] = better
+        nearest = initial._nearest(avatar, disagreement)
+        inner = ndimage.binary_erosion(face, iterations=initial.MEDIAN)
+        assert (nearest[inner] == taken).all() and (nearest[ndimage.binary_erosion(~face, iterations=initial.MEDIAN)] == 0).all()
+    unknown = np.full((skin + 1, side, side), np.inf)  # that no frame saw
+    assert (initial._nearest(avatar, unknown) == skin).all()
