@@ -1,7 +1,8 @@
 """Where on each ray a picture's samples go: where the field's density at voxel centres says that light ends.
 
 One evaluation of the field at the centre of each voxel of the shell that a ray can see, then every ray's samples between the
-cells that matter to it; these alone are composited. Geometry without gradients, in numpy and numba. Letters: N rays, P samples.
+cells that matter to it; `marching` goes on where these leave light. Geometry without gradients, in numpy and numba. Letters: N
+rays, P samples.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def guided(
     """Samples of each ray over the cells of the shell that hold its light or lie beside those, and where [N] m they stop.
 
     They stop before the shell does where the densities say that light has ended. A voxel's centre may know less than the ray:
-    what light is left there by the samples themselves goes on. Infinite where the shell or, at the core, the ray ends.
+    what light is left there by the samples themselves goes on. Infinite where they go on to the end of the shell or to the core.
 
     density: from `seen_density`; step_m: length for one sample, most: samples on a ray, at least LEAST of it on each.
     A sample stands for the length of shell around it, halfway in weight to its neighbours; the last one of a ray that the core
@@ -97,8 +98,7 @@ def _guide(
     for n in range(len(origins)):
         count, met = shell.cells(labels, voxel, origins[n], directions[n], np.inf, start, stop, place)
         count, stopped = _shares(met, count, start, stop, place, flat, end, weight, share)
-        if not met:
-            stops[n] = stopped
+        stops[n] = stopped
         if not count:
             continue
         kept = 0.0
@@ -119,7 +119,7 @@ def _guide(
                     break
                 passed, i = edge, i + 1
             distance[at], step[at], ray[at], slot[at] = position, stood, n, s
-            closed[at] = met and s == number - 1
+            closed[at] = met and stopped == np.inf and s == number - 1
             at += 1
     return at
 

@@ -167,14 +167,13 @@ class RadianceAvatar(nn.Module):
     def _off_rays(self, posed: Posed, head: int, numbers: np.ndarray) -> Packed:
         """Random places outside the shell of one head and, a quarter, inside its skull; three numbers [N] in [0, 1) for each."""
         few, vertices_m = numbers[: len(numbers) // 3 * 3].reshape(-1, 3), posed.vertices_m[head].cpu().numpy()
-        most = 3 * len(few) // 4
-        outer = sampling.outside(posed.grids[head], vertices_m, few[:most], head)
         if not len(self.core_m):
-            return outer
+            return sampling.outside(posed.grids[head], vertices_m, few, head)
         if self.core_tree is None:
             self.core_tree = cKDTree(self.core_m.cpu().numpy())
-        inner = sampling.inside(self.core_tree, vertices_m, few[most:, :2], head)
-        return sampling.join([outer, inner])
+        most = 3 * len(few) // 4
+        outer = sampling.outside(posed.grids[head], vertices_m, few[:most], head, self.core_tree)
+        return sampling.join([outer, sampling.inside(self.core_tree, vertices_m, few[most:, :2], head)])
 
     def _coarse_to_fine(
         self,

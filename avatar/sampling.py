@@ -70,11 +70,12 @@ def ball(vertices_m: np.ndarray) -> tuple[np.ndarray, float]:
     return centre, float(np.linalg.norm(within - centre, axis=1).max() + MARGIN_M)
 
 
-def outside(grid: shell.Grid, vertices_m: np.ndarray, numbers: np.ndarray, head: int = 0) -> Packed:
-    """Points of the sphere of `bounds` that lie neither in the shell nor in the core; on no ray: slot OUTSIDE_SLOT.
+def outside(grid: shell.Grid, vertices_m: np.ndarray, numbers: np.ndarray, head: int = 0, core: cKDTree | None = None) -> Packed:
+    """Points of the sphere of `bounds` that lie neither in the shell nor beneath it; on no ray: slot OUTSIDE_SLOT.
 
     numbers: [M, 3] in [0, 1), for a point each: every second is spread evenly over the sphere, the others lie up to BESIDE_M
-    from a vertex, where the field has most to forget. They are seen along no direction.
+    from a vertex, where the field has most to forget. They are seen along no direction. core: tree of the core's points: what
+    lies between shell and core is skull.
     """
     centre, radius = ball(vertices_m)
     height, turn = 2 * numbers[:, 1] - 1, 2 * np.pi * numbers[:, 2]
@@ -86,6 +87,8 @@ def outside(grid: shell.Grid, vertices_m: np.ndarray, numbers: np.ndarray, head:
     voxel = np.floor((points - grid.origin) / shell.VOXEL_M)
     empty = ~((voxel >= 0) & (voxel < grid.labels.shape)).all(1)
     empty[~empty] = grid.labels[tuple(voxel[~empty].astype(np.int64).T)] == shell.EMPTY
+    if core is not None:
+        empty[empty] = core.query(points[empty], distance_upper_bound=shell.CORE_DEPTH_M)[0] > shell.CORE_DEPTH_M
     return _loose(points[empty], OUTSIDE_SLOT, head)
 
 

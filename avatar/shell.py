@@ -73,8 +73,12 @@ def occupancy(vertices_m: np.ndarray, thickness_m: np.ndarray, core_m: np.ndarra
     origin = low * VOXEL_M
     index = np.floor((core_m - origin) / VOXEL_M).astype(int)
     index = index[((index >= 0) & (index < shape)).all(1)]
-    labels[tuple(index.T)] = CORE
-    _mark(labels, np.asarray(vertices_m, np.float64) - origin, np.asarray(thickness_m, np.float64), VOXEL_M)
+    points, radii = np.asarray(vertices_m, np.float64) - origin, np.asarray(thickness_m, np.float64)
+    _mark(labels, points, radii, VOXEL_M)
+    labels[tuple(index.T)] = CORE  # thick hair reaches as far into the skull as out of it
+    _mark(
+        labels, points, np.minimum(radii, CORE_DEPTH_M), VOXEL_M
+    )  # but a jaw that opens moves into the core of the neutral head
     return Grid(origin, labels)
 
 

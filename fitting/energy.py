@@ -16,6 +16,10 @@ from fitting import camera
 from fitting.landmark_model import LandmarkModel
 from fitting.rig import GAZE, JAW, POSE, Pose, Posed, Surface, jacobian, posed
 
+# Standard deviation of the lid gap of a shut eye over that of an open one; in between by how open it looks (`observed`).
+# nerface.mp4, lids shut: 6 px of gap were left, 4 px with this and the stronger photometric term.
+SHUT_SIGMA = 0.25
+
 
 @dataclass(frozen=True)
 class Weights:
@@ -58,10 +62,6 @@ class Frame:
     expression_mean: np.ndarray  # [E] centre of the expression prior
     open_eyes: np.ndarray  # [2] 1 open, 0 shut; left, right
     gaze_mean: np.ndarray  # [4] where the gaze is held while an eye is shut
-
-
-SHUT_SIGMA = 0.25  # of the lid gap of a shut eye, which is surely none, over that of an open one
-# (nerface.mp4, lids shut: 6 px of gap before, 4 px with this and the stronger photometric term.)
 
 
 @dataclass(frozen=True)

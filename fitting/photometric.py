@@ -47,13 +47,13 @@ class Appearance:
     explained: float  # part of the residual variance that the light explains on keyframes it was not learned from
 
 
-def choose_samples(rig: Rig, count: int, seed: int = 0, regions: Sequence[str] = SAMPLED) -> Samples:
-    """Area-weighted random points, of face and ears unless told, twice as dense at the front of the face where features are.
+def choose_samples(rig: Rig, count: int, seed: int = 0) -> Samples:
+    """Area-weighted random points of face and ears, twice as dense at the front of the face where features are.
 
-    Eyeballs and mouth cavity are left out: they move otherwise than the mesh says. For the scalp see `fitting.hair`.
+    Eyeballs, mouth cavity and scalp are left out: they move or look otherwise than the mesh says.
     """
     random = np.random.default_rng(seed)
-    wanted = np.isin(rig.region, [REGIONS.index(name) for name in regions])[rig.triangles].all(1)
+    wanted = np.isin(rig.region, [REGIONS.index(name) for name in SAMPLED])[rig.triangles].all(1)
     corners = rig.template[rig.triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) * wanted
     front = corners.mean(1)[:, 2] < np.quantile(corners.mean(1)[wanted, 2], 0.5)
@@ -117,10 +117,10 @@ def read(level: Level, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return out, inside
 
 
-def depth_buffer(
-    rig_vertices: Surface, triangles: np.ndarray, pose: Pose, lens: Camera, size: tuple[int, int]
-) -> tuple[np.ndarray, float]:
-    """Depth [h, w] float32 m of the nearest triangle (inf where none is), in a coarse picture; its size over the picture's.
+def visible(
+    rig_vertices: Surface, triangles: np.ndarray, pose: Pose, lens: Camera, size: tuple[int, int], points: np.ndarray
+) -> np.ndarray:
+    """Which points [P, 3] m (camera axes) nothing of the mesh hides [P] bool.
 
     Args:
         rig_vertices: all vertices, folded; size: (H, W) of the picture.
@@ -131,20 +131,10 @@ def depth_buffer(
     first, second, third = (mesh[triangles[:, k], :2] for k in range(3))
     side, other = second - first, third - first
     front = side[:, 0] * other[:, 1] < side[:, 1] * other[:, 0]  # seen from outside, outward triangles run anticlockwise
-    return raster.rasterise(mesh, triangles[front], shape)[1], shrink
-
-
-def visible(buffer: tuple[np.ndarray, float], lens: Camera, points: np.ndarray) -> np.ndarray:
-    """Which points [P, 3] m (camera axes) of the picture lie before the mesh [P] bool; buffer: of `depth_buffer`.
-
-    One that stands off the skull and is seen beside its outline does not: where along its ray such hair is, is least certain
-    (nerface.mp4 with it: the head left over by 0.61 degrees on test frames in place of 0.42, jitter 0.47 mm in place of 0.41).
-    """
-    depth, shrink = buffer
-    height, width = depth.shape
+    _, depth, _ = raster.rasterise(mesh, triangles[front], shape)
     pixel = camera.project(points, lens.focal_px * shrink, lens.centre_px * shrink).astype(int)
-    inside = ((pixel >= 0) & (pixel < [width, height])).all(1)
-    pixel = np.clip(pixel, 0, [width - 1, height - 1])
+    inside = ((pixel >= 0) & (pixel < [shape[1], shape[0]])).all(1)
+    pixel = np.clip(pixel, 0, [shape[1] - 1, shape[0] - 1])
     # The buffer is coarse: a sample on a slope may lie behind its pixel's centre, so the farthest of its neighbours counts.
     far = cv2.dilate(np.where(np.isfinite(depth), depth, 0), np.ones((3, 3), np.uint8))
     return inside & (points[:, 2] < far[pixel[:, 1], pixel[:, 0]] + DEPTH_TOLERANCE_M)
@@ -217,15 +207,22 @@ def inside(alpha: np.ndarray, pixels: np.ndarray, margin_px: float) -> np.ndarra
     return out
 
 
-def learn(values: np.ndarray, weights: np.ndarray, normals: np.ndarray) -> Appearance:
+def learn(pictures: list[list[Level]], pixels: np.ndarray, weights: np.ndarray, normals: np.ndarray) -> Appearance:
     """Albedo, light and residual spread from keyframes, by alternation.
 
     The light is modelled only where it explains keyframes that it was not learned from: every other one is kept out once.
 
     Args:
-        values: [levels, K, P] grey; weights: [K, P] 0 where not seen; normals: [K, P, 3] camera axes.
+        pictures: K pyramids; pixels: [K, P, 2]; weights: [K, P] 0 where not seen; normals: [K, P, 3] camera axes.
     """
-    keyframes = len(weights)
+    keyframes, count = weights.shape
+    values = np.zeros((len(LEVELS), keyframes, count))
+    weights = weights.copy()
+    for k in range(keyframes):
+        for level, picture in enumerate(pictures[k]):
+            value, seen = read(picture, pixels[k])
+            values[level, k] = value[:, 0]
+        weights[k] *= seen
     shapes = np.stack([harmonics(normal) for normal in normals])  # [K, P, 8]
     explained = _explained(values[-1], weights, shapes) if keyframes >= 6 else 0.0
     light = _alternate(values[-1], weights, shapes)[1] if explained > LEAST_EXPLAINED else np.zeros(8)
@@ -233,20 +230,6 @@ def learn(values: np.ndarray, weights: np.ndarray, normals: np.ndarray) -> Appea
     fitted = [_alternate(value / shade, weights, None) for value in values]
     sigma = np.array([max(one[2], 1.0) for one in fitted])
     return Appearance(np.stack([one[0] for one in fitted]), light, sigma, explained)
-
-
-def disagreement(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Variance [P] of each sample's value over the keyframes, their gains taken out; NaN where seen in fewer than two.
-
-    Args:
-        values, weights: [K, P], weights 0 where not seen.
-    """
-    albedo, _, _ = _alternate(values, weights, None)
-    known = np.where(np.isfinite(albedo), weights, 0.0)
-    told = np.where(np.isfinite(albedo), albedo, 0.0)
-    gain = (known * told * values).sum(1) / np.maximum((known * told**2).sum(1), 1e-9)
-    total = known.sum(0)
-    return np.where(total > 0, (known * (values - gain[:, None] * told) ** 2).sum(0) / np.maximum(total, 1e-9), np.nan)
 
 
 def _explained(values: np.ndarray, weights: np.ndarray, shapes: np.ndarray) -> float:

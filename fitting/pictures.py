@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
-from fitting import camera, hair, photometric, silhouette
+from fitting import camera, photometric, silhouette
 from fitting.energy import Camera, Term
 from fitting.photometric import Appearance, Samples
 from fitting.rig import Pose, Rig, Surface, posed
 from fitting.state import State
 
 FINEST = len(photometric.LEVELS) - 1
-HAIR_SHARE = 0.5  # samples of the scalp over those of the skin: half of a scalp is never seen
 
 
 @dataclass(frozen=True)
@@ -23,7 +21,6 @@ class Strength:
     """How much the terms that read pixels count; 0 leaves one out."""
 
     photometric: float  # of one sample against one landmark of standard deviation 1: neighbouring samples err together
-    hair: float  # the same of one sample of the hair
     photometric_robust: float  # Huber's threshold in standard deviations
     silhouette: float  # of one point of the rim
     silhouette_sigma: float  # of the matte's edge, in inter-ocular distances
@@ -34,28 +31,12 @@ Extra = Callable[[State, int], tuple[tuple[Term, Surface], ...]]  # terms of one
 
 
 @dataclass(frozen=True)
-class Patch:
-    """Samples that are compared, by themselves as exposure goes: those of the skin, or of the hair."""
-
-    samples: Samples
-    appearance: Appearance
-    strength: float
-
-
-@dataclass(frozen=True)
-class Seen:
-    """How a patch is seen in one frame."""
-
-    weight: np.ndarray  # [P] float32, 0 where hidden
-    shade: np.ndarray  # [P] float32 light on each sample
-    pixels: np.ndarray  # [P, 2] float32
-
-
-@dataclass(frozen=True)
 class Look:
-    """How the patches and the mesh's outline are seen in one frame."""
+    """How the samples and the mesh's outline are seen in one frame; None for a term that is off."""
 
-    seen: tuple[Seen, ...]
+    weight: np.ndarray | None  # [P] float32, 0 where hidden
+    shade: np.ndarray | None  # [P] float32 light on each sample
+    pixels: np.ndarray | None  # [P, 2] float32
     rim: silhouette.Rim | None  # the mesh's outline against the matte; None without the term
     edge: silhouette.Edge | None
 
@@ -77,26 +58,19 @@ class Pictures:
         self.size = frames.shape[1:3]
         self.whole = rig.vertices()
         self.samples: Samples = photometric.choose_samples(rig, samples)
-        self.patches: tuple[Patch, ...] = ()
+        self.appearance: Appearance | None = None
         self.skin: silhouette.Skin | None = None
-        self._folded: list[tuple[Surface, np.ndarray, Surface]] = []
+        self._folded: tuple[np.ndarray, Surface, Surface] | None = None
 
-    @property
-    def appearance(self) -> Appearance | None:
-        """What the skin looks like; None before `learn`."""
-        return self.patches[0].appearance if self.patches else None
-
-    def fold(self, surface: Surface, shape: np.ndarray) -> Surface:
-        """A surface folded with one identity [S]; the last few are kept."""
-        for one, known, folded in self._folded:
-            if one is surface and np.array_equal(known, shape):
-                return folded
-        self._folded = [(surface, shape.copy(), surface.folded(shape)), *self._folded[:3]]
-        return self._folded[0][2]
+    def fold(self, shape: np.ndarray) -> tuple[Surface, Surface]:
+        """All vertices and the samples, folded with one identity [S] (kept until another one is asked for)."""
+        if self._folded is None or not np.array_equal(self._folded[0], shape):
+            self._folded = (shape.copy(), self.whole.folded(shape), self.samples.surface.folded(shape))
+        return self._folded[1:]
 
     def learn_skin(self, rows: Sequence[int], state: State, lens: Camera) -> None:
         """Colour of the skin, from the photometric samples of some frames (state of these rows)."""
-        samples = self.fold(self.samples.surface, state.shape)
+        _, samples = self.fold(state.shape)
         pixels = []
         for k in range(len(rows)):
             at = posed(samples, state.pose(k))
@@ -104,62 +78,33 @@ class Pictures:
             pixels.append(camera.project(at.points[facing], lens.focal_px, lens.centre_px))
         self.skin = silhouette.skin_of([self.frames[row] for row in rows], pixels)
 
-    def learn(self, rows: Sequence[int], state: State, lens: Camera) -> None:
-        """What skin and hair look like, from training keyframes (state of these rows)."""
-        buffers = [self._buffer(state.pose(k), state.shape, lens) for k in range(len(rows))]
-        values_of = partial(self._values, rows=rows, state=state, lens=lens, buffers=buffers)
-        chosen = [(self.samples, self.strength.photometric)]
-        scalp = hair.choose_samples(self.rig, round(HAIR_SHARE * len(self.samples.triangles)))
-        if scalp is not None:
-            values, weights = values_of(hair.swept(self.rig, scalp), levels=[FINEST])
-            chosen.append((hair.settled(scalp, values[0], weights), self.strength.hair))
-        patches = []
-        for samples, strength in chosen:
-            normal = self.fold(samples.surface, state.shape).normal
-            turned = np.stack([normal @ turn.T for turn in state.rotation])
-            appearance = photometric.learn(*values_of(samples, levels=range(FINEST + 1)), turned)
-            patches.append(Patch(samples, appearance, strength))
-        self.patches = tuple(patches)
-
-    def _values(
-        self,
-        samples: Samples,
-        levels: Sequence[int],
-        rows: Sequence[int],
-        state: State,
-        lens: Camera,
-        buffers: Sequence[tuple[np.ndarray, float]],
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Grey values [levels, K, P] and weights [K, P] of samples in frames (state and depth of these rows)."""
-        values, weights = np.zeros((len(levels), len(rows), len(samples.triangles))), []
+    def learn(self, rows: Sequence[int], state: State, lens: Camera) -> Appearance:
+        """Albedo and light from training keyframes (state of these rows)."""
+        _, samples = self.fold(state.shape)
+        pyramids, pixels, weights, normals = [], [], [], []
         for k, row in enumerate(rows):
-            pixel, weight = self._seen(samples, row, state.pose(k), state.shape, lens, buffers[k])
-            for place, picture in enumerate(photometric.pyramid(self.frames[row], pixel, self.scale_px[row], levels)):
-                value, inside = photometric.read(picture, pixel)
-                values[place, k], weight = value[:, 0], weight * inside
+            pixel, weight = self._seen(row, state.pose(k), state.shape, lens)
+            pixels.append(pixel)
+            pyramids.append(photometric.pyramid(self.frames[row], pixel, self.scale_px[row], range(FINEST + 1)))
             weights.append(weight)
-        return values, np.stack(weights)
+            normals.append(samples.normal @ state.rotation[k].T)
+        self.appearance = photometric.learn(pyramids, np.stack(pixels), np.stack(weights), np.stack(normals))
+        return self.appearance
 
-    def _buffer(self, pose: Pose, shape: np.ndarray, lens: Camera) -> tuple[np.ndarray, float]:
-        """Depth of the head in one pose (see `photometric.depth_buffer`)."""
-        return photometric.depth_buffer(self.fold(self.whole, shape), self.rig.triangles, pose, lens, self.size)
-
-    def _seen(
-        self, samples: Samples, row: int, pose: Pose, shape: np.ndarray, lens: Camera, buffer: tuple[np.ndarray, float]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels [P, 2] and weights [P] of samples: nothing for hidden ones and where the blur mixes in the background."""
-        surface = self.fold(samples.surface, shape)
-        at = posed(surface, pose)
+    def _seen(self, row: int, pose: Pose, shape: np.ndarray, lens: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels [P, 2] and weights [P] of the samples: nothing for hidden ones and where the blur mixes in the background."""
+        whole, samples = self.fold(shape)
+        at = posed(samples, pose)
+        seen = photometric.visible(whole, self.rig.triangles, pose, lens, self.size, at.points)
         pixel = camera.project(at.points, lens.focal_px, lens.centre_px)
-        seen = photometric.visible(buffer, lens, at.points)
         seen &= photometric.inside(self.alpha[row], pixel, photometric.LEVELS[FINEST] * self.scale_px[row])
-        return pixel, photometric.weights_of(surface, pose, seen)
+        return pixel, photometric.weights_of(samples, pose, seen)
 
     def silhouette_extra(self, rows: Sequence[int], state: State, centre_px: np.ndarray) -> Extra:
         """Extra terms of the joint calibration (see `fitting.calibrate.refine`): the rim is found around `state`, then held."""
         lens = state.lens(centre_px)
         edges = [silhouette.edge_of(self.alpha[row]) for row in rows]
-        whole = self.fold(self.whole, state.shape)
+        whole, _ = self.fold(state.shape)
         rims = [
             silhouette.rim_of(
                 self.rig, whole, state.pose(k), lens, self.size, self.frames[row], edges[k], self.skin, self.scale_px[row]
@@ -181,17 +126,15 @@ class Pictures:
 
     def look(self, row: int, pose: Pose, shape: np.ndarray, lens: Camera) -> Look:
         """Visibility and shading of the samples around a pose: worked out once a frame, they change slowly."""
-        seen, rim, edge = [], None, None
-        buffer = self._buffer(pose, shape, lens) if self.patches else None
-        for patch in self.patches:
-            pixel, weight = (part.astype(np.float32) for part in self._seen(patch.samples, row, pose, shape, lens, buffer))
-            normal = self.fold(patch.samples.surface, shape).normal @ pose.rotation.T
-            shade = np.clip(1 + photometric.harmonics(normal) @ patch.appearance.light, 0.3, None).astype(np.float32)
-            seen.append(Seen(weight, shade, pixel))
+        weight = shade = pixel = rim = edge = None
+        if self.appearance is not None:
+            pixel, weight = (values.astype(np.float32) for values in self._seen(row, pose, shape, lens))
+            normal = self.fold(shape)[1].normal @ pose.rotation.T
+            shade = np.clip(1 + photometric.harmonics(normal) @ self.appearance.light, 0.3, None).astype(np.float32)
         if self.strength.silhouette and self.skin is not None:
-            edge, whole = silhouette.edge_of(self.alpha[row]), self.fold(self.whole, shape)
+            edge, whole = silhouette.edge_of(self.alpha[row]), self.fold(shape)[0]
             rim = silhouette.rim_of(self.rig, whole, pose, lens, self.size, self.frames[row], edge, self.skin, self.scale_px[row])
-        return Look(tuple(seen), rim, edge)
+        return Look(weight, shade, pixel, rim, edge)
 
     def silhouette_terms(self, row: int, look: Look, shape: np.ndarray, lens: Camera) -> list[Term]:
         """The silhouette term of one frame, if it has one."""
@@ -202,14 +145,21 @@ class Pictures:
         return [term]
 
     def photometric_terms(self, row: int, look: Look, shape: np.ndarray, lens: Camera, levels: Sequence[int]) -> list[Term]:
-        """The photometric terms of one frame, of each patch at some pyramid levels; none where they are off."""
-        terms = []
-        for patch, seen in zip(self.patches, look.seen, strict=True):
-            surface = self.fold(patch.samples.surface, shape)
-            pyramid = photometric.pyramid(self.frames[row], seen.pixels, self.scale_px[row], levels)
-            for picture, level in zip(pyramid, levels, strict=True):
-                colour = patch.appearance.albedo[level] * seen.shade
-                told = picture, colour, seen.weight, patch.appearance.sigma[level], patch.strength, lens
-                rows = partial(photometric.photometric_rows, *told, self.strength.photometric_robust)
-                terms.append(Term(surface, rows))
-        return terms
+        """The photometric term of one frame at some pyramid levels; none where it is off."""
+        if self.appearance is None:
+            return []
+        _, samples = self.fold(shape)
+        pyramid = photometric.pyramid(self.frames[row], look.pixels, self.scale_px[row], levels)
+        strength, appearance = self.strength, self.appearance
+
+        def one(picture: photometric.Level, level: int) -> Term:
+            colour, sigma = appearance.albedo[level] * look.shade, appearance.sigma[level]
+            robust = strength.photometric_robust
+            return Term(
+                samples,
+                lambda at: photometric.photometric_rows(
+                    picture, colour, look.weight, sigma, strength.photometric, lens, robust, at
+                ),
+            )
+
+        return [one(picture, level) for picture, level in zip(pyramid, levels, strict=True)]

@@ -44,11 +44,9 @@ ANOTHER_FACE = 2.5  # a stretch between two cuts whose median error is this many
 LOST_OF_MEDIAN, LOST_OF_EYES = 4.0, 0.05  # a frame this much worse than the median, and this bad, is lost
 SAMPLES = 2000
 PIXEL_ITERATIONS = 3  # a level of the photometric pyramid
-APPEARANCE_ROUNDS = 3  # skin and hair are learned from the keyframes as landmarks place them, then as their own pixels do
+APPEARANCE_ROUNDS = 3  # the skin is learned from the keyframes as landmarks place them, then as their own pixels do
 SILHOUETTE_ROUNDS = 3  # the rim is found anew this often
-STRENGTH = Strength(
-    photometric=0.1, hair=0.4, photometric_robust=3.0, silhouette=0.05, silhouette_sigma=0.01, silhouette_robust=3.0
-)
+STRENGTH = Strength(photometric=0.1, photometric_robust=3.0, silhouette=0.05, silhouette_sigma=0.01, silhouette_robust=3.0)
 
 
 def weights(terms: TermWeights) -> Weights:
@@ -66,8 +64,5 @@ def weights(terms: TermWeights) -> Weights:
 def strength(terms: TermWeights) -> Strength:
     """The pixel terms with their weights from config."""
     return replace(
-        STRENGTH,
-        photometric=STRENGTH.photometric * terms.photometric,
-        hair=STRENGTH.hair * terms.photometric,
-        silhouette=STRENGTH.silhouette * terms.silhouette,
+        STRENGTH, photometric=STRENGTH.photometric * terms.photometric, silhouette=STRENGTH.silhouette * terms.silhouette
     )

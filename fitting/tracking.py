@@ -210,7 +210,7 @@ def _problem(
 
 
 def _learn(clip: Clip, keyframes: np.ndarray, tracker: stages.Tracker, pictures: Pictures, state: State) -> None:
-    """What skin and hair look like: from the keyframes as the landmarks place them, then from those as their pixels do."""
+    """What the skin looks like: from the keyframes as the landmarks place them, then as their own pixels do."""
     pictures.learn(keyframes, state.frames(keyframes), tracker.lens)
     for _ in range(settings.APPEARANCE_ROUNDS - 1):
         state, _ = _refine(clip, tracker, pictures, state, keyframes, lambda rows, _: rows)

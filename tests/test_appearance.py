@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fitting import camera, photometric
-from fitting.photometric import LEVELS
+from fitting.photometric import LEVELS, Level
 from fitting.rig import Rig, Surface, posed
 from tests.landmarked import LENS, SIZE, landmarked_head, model_of, random_state
 
@@ -67,7 +67,7 @@ def test_visibility_against_rays(made, yaw):
     )
     corners = mesh[triangles[chosen]]
     points = np.einsum("pk,pkd->pd", random.dirichlet([1, 1, 1], len(chosen)), corners)
-    seen = photometric.visible(photometric.depth_buffer(surface, triangles, pose, LENS, SIZE), LENS, points)
+    seen = photometric.visible(surface, triangles, pose, LENS, SIZE, points)
     deep, grazing = (hidden_by(points, mesh, triangles, slack) for slack in (0.012, 1e-4))
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     toward = (outward * -points).sum(1) > 0.2 * np.linalg.norm(outward, axis=1) * np.linalg.norm(points, axis=1)
@@ -83,7 +83,7 @@ def test_points_outside_the_picture_are_not_seen(made):
     pose = replace(pose, translation=np.array([0.24, 0, 0.6]))
     points = posed(rig.vertices(), pose).points
     pixel = camera.project(points, LENS.focal_px, LENS.centre_px)
-    seen = photometric.visible(photometric.depth_buffer(rig.vertices(), rig.triangles, pose, LENS, SIZE), LENS, points)
+    seen = photometric.visible(rig.vertices(), rig.triangles, pose, LENS, SIZE, points)
     assert seen.any() and not seen[pixel[:, 0] > SIZE[1] + 1].any()
 
 
@@ -97,12 +97,17 @@ def test_harmonics_are_orthogonal_and_without_constant():
     assert np.abs(gram - np.diag(np.diag(gram))).max() < 1e-3 and np.diag(gram).min() > 0.05
 
 
+def row_level(row, columns):
+    padded = np.pad(row.reshape(-1, columns), (0, 2))[..., None]
+    return Level(np.repeat(padded, 3, -1).astype(np.float32), np.zeros(2, int))
+
+
 def harmonics(normals):
     return np.stack([photometric.harmonics(normal) for normal in normals])
 
 
 def learned(light, noise=0.5, seed=0, keyframes=12, count=1500, gains=True):
-    """Grey values [levels, K, P], weights and normals of a turning Lambert sphere, and its true albedo."""
+    """Appearance of a turning Lambert sphere, its truth: every sample lies on a pixel of its own."""
     random = np.random.default_rng(seed)
     normal = random.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -114,15 +119,17 @@ def learned(light, noise=0.5, seed=0, keyframes=12, count=1500, gains=True):
     gain = random.uniform(0.9, 1.1, keyframes) if gains else np.ones(keyframes)
     gain /= gain.mean()
     value = gain[:, None] * albedo * (1 + harmonics(normals) @ light) + noise * random.normal(size=(keyframes, count))
+    columns = 50
+    pixels = np.stack([np.arange(count) % columns, np.arange(count) // columns], 1) + 0.5
     weight = np.where(-normals[..., 2] > 0.2, normals[..., 2] ** 2, 0.0)
-    return np.stack([value] * len(LEVELS)), weight, normals, albedo
+    return [[row_level(row, columns)] * len(LEVELS) for row in value], np.tile(pixels, (keyframes, 1, 1)), weight, normals, albedo
 
 
 def test_light_of_a_lambert_sphere_is_found():
     light = np.array([0.25, -0.12, -0.15, 0.05, 0.04, 0.02, -0.06, 0.03])
-    values, weights, normals, albedo = learned(light)
-    appearance = photometric.learn(values, weights, normals)
-    shade, found = (1 + harmonics(normals) @ one for one in (light, appearance.light))
+    pictures, pixels, weights, normals, albedo = learned(light)
+    appearance = photometric.learn(pictures, pixels, weights, normals)
+    shade, found = (1 + harmonics(normals) @ values for values in (light, appearance.light))
     seen = weights > 0
     assert np.corrcoef(found[seen], shade[seen])[0, 1] > 0.9 and appearance.explained > 0.9
     known = np.isfinite(appearance.albedo[-1])
@@ -136,8 +143,8 @@ def test_light_of_a_lambert_sphere_is_found():
 
 
 def test_no_light_model_is_no_light():
-    values, weights, normals, albedo = learned(np.zeros(8))
-    plain = photometric.learn(values, weights, normals)
+    pictures, pixels, weights, normals, albedo = learned(np.zeros(8))
+    plain = photometric.learn(pictures, pixels, weights, normals)
     assert not plain.light.any() and plain.explained < photometric.LEAST_EXPLAINED
     known = np.isfinite(plain.albedo[-1])
     np.testing.assert_allclose(plain.albedo[-1][known] / albedo[known], 1, atol=0.03)

@@ -63,7 +63,7 @@ def twin(grid: shell.Grid, density: np.ndarray, origin: np.ndarray, direction: n
         light *= through
         beyond += light < end
         if beyond == 2:
-            stopped = leave if len(weights) < len(cells) and not met else np.inf
+            stopped = leave if len(weights) < len(cells) else np.inf
             break
     if met and weights and beyond < 2:
         weights[-1] += light
@@ -79,7 +79,8 @@ def twin(grid: shell.Grid, density: np.ndarray, origin: np.ndarray, direction: n
     edges = np.interp(np.arange(number + 1) / number, passed, run)
     middles = np.interp((np.arange(number) + 0.5) / number, passed, run)
     cell = np.clip(np.searchsorted(run, middles) - 1, 0, len(kept) - 1)
-    return np.array([kept[c][0][0] + m - run[c] for c, m in zip(cell, middles, strict=True)]), np.diff(edges), met, stopped
+    ends = met and stopped == np.inf
+    return np.array([kept[c][0][0] + m - run[c] for c, m in zip(cell, middles, strict=True)]), np.diff(edges), ends, stopped
 
 
 @pytest.mark.parametrize(("step", "most", "end"), [(0.001, 16, 0.004), (0.004, 5, 0.0), (0.1, 1, 0.3)])
@@ -131,8 +132,11 @@ def test_where_samples_stop_before_the_shell_does() -> None:
         np.array([[0.002, 0.002, -1], [0.006, 0.002, -1], [0.01, 0.002, -1]], np.float32), np.array([[0, 0, 1]] * 3, np.float32)
     )
     samples, stops = guide.guided(shell.Grid(np.zeros(3), labels), density, rays, 0.001, 8, 0.004)
-    assert stops == pytest.approx([1 + 7 * shell.VOXEL_M, np.inf, np.inf])  # more shell behind, the core, the shell's end
-    assert samples.distance_m[samples.ray == 0].max() < stops[0] and samples.closed[samples.ray == 1][-1]
+    assert stops == pytest.approx([1 + 7 * shell.VOXEL_M, 1 + 7 * shell.VOXEL_M, np.inf])  # more shell behind; the shell's end
+    assert samples.distance_m[samples.ray == 0].max() < stops[0] and not samples.closed.any()
+    labels[1, 0, 7] = shell.CORE
+    samples, stops = guide.guided(shell.Grid(np.zeros(3), labels), density, rays, 0.001, 8, 0.004)
+    assert stops[1] == np.inf and samples.closed.sum() == 1 and samples.closed[samples.ray == 1][-1]  # as far as the core
 
 
 def test_lone_voxels_and_their_neighbours_are_sampled_and_clear_air_is_not() -> None:

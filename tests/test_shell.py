@@ -60,11 +60,25 @@ def test_a_ray_ends_at_the_core_and_the_core_is_deep_inside(head: tuple[np.ndarr
     through, *_ = shell.intervals(shell.occupancy(vertices, thickness, NONE), origin, direction)
     stopped, count, met = shell.intervals(grid, origin, direction)
     assert count[0] == 1 and (through[0, :2, 0] > 0).all()
-    np.testing.assert_allclose(stopped[0, 0], through[0, 0])
+    assert stopped[0, 0, 0] == through[0, 0, 0] and 0 <= through[0, 0, 1] - stopped[0, 0, 1] < 2 * shell.VOXEL_M  # 30 mm thick
     assert met[0] and not shell.intervals(grid, origin + [0.3, 0, 0], direction)[2][0]
     samples = shell.sample(stopped, count, 0.002, 8, None, met)
     assert samples.closed.tolist() == [False] * (len(samples.ray) - 1) + [True]
     assert not shell.sample(stopped, count, 0.002, 8, None).closed.any()
+
+
+def test_hair_thicker_than_the_skull_is_deep_leaves_the_core(head: tuple[np.ndarray, np.ndarray]) -> None:
+    vertices, _ = head
+    core = shell.core_points(vertices, vertex_normals(vertices, toy_head().triangles.numpy()))
+    grid = shell.occupancy(vertices, np.full(len(vertices), 0.07), core)
+    assert (grid.labels == shell.CORE).sum() == len(core)
+    assert shell.intervals(grid, np.array([[0.001, 0.001, -0.6]]), np.array([[0.0, 0.0, 1.0]]))[2][0]
+    moved = vertices.copy()
+    moved[0] = core[0]  # a vertex that moves into it clears its own surroundings
+    near = np.linalg.norm(core - core[0], axis=1) < shell.CORE_DEPTH_M / 2
+    labels = shell.occupancy(moved, np.full(len(vertices), 0.07), core)
+    index = np.floor((core[near] - labels.origin) / shell.VOXEL_M).astype(int)
+    assert (labels.labels[tuple(index.T)] == shell.SHELL).all()
 
 
 @pytest.mark.parametrize("direction", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 0], [1e-15, 0, 1]])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from avatar.features import Condition
 from avatar.layered import composite, packing, raster, shells
@@ -25,7 +26,7 @@ from fitting.head_model import HeadModel
 from fitting.raster import vertex_normals
 
 FADE, ASIDE = 8.0, 0.5  # logits of opacity that a shell loses at first when seen edge on, and the cosine from which it does
-FADING = 10.0  # how much faster than the networks each place learns whether it does
+FADING, UNIT = 10.0, 0.5413  # how far a step moves a place's own factor on that, and what makes the factor 1 at first
 LARGEST_MOVE = 0.03  # of a fetch in UV: what tracking and shape are wrong by, never another part of the face
 MOVES_M = 0.003  # expressions move the skin by millimetres: inputs of about one
 WIDTH = 64  # channels of the U-Net's output
@@ -64,7 +65,7 @@ class LayeredAvatar(nn.Module):
         textures = torch.zeros(count, side, side, composite.texture_channels(bases))
         textures[..., 4:] = torch.randn(textures[..., 4:].shape) * BASIS_START
         self.register_buffer("textures", textures)  # trained by `texel_adam`
-        # How much of FADE each place of each shell takes; learned, times FADING to be quick.
+        # What each place of each shell that is not beneath the skin makes of FADE.
         self.fading = nn.Parameter(torch.zeros(count - 2, settings["uv_size"], settings["uv_size"]))
         self.unet = UNet(9, WIDTH)
         self.out = nn.Conv2d(WIDTH, count * composite.map_channels(bases), 1)
@@ -147,7 +148,7 @@ class LayeredAvatar(nn.Module):
         maps = self.out(self.unet(told[None, :-1])).unflatten(1, (self.count, -1))[0].permute(0, 2, 3, 1)
         move, colour, opacity, weights = maps.split([composite.MOVE, 3, 1, self.bases], -1)
         aside = 1 - torch.clamp(told[-1] / ASIDE, 0, 1)
-        fade = FADE * aside.square() * torch.relu(1 + FADING * self.fading)
+        fade = FADE * aside.square() * functional.softplus(FADING * self.fading + UNIT)
         fade = torch.cat([fade, fade.new_zeros(self.count - len(fade), *fade.shape[1:])])[..., None]
         return torch.cat([LARGEST_MOVE * torch.tanh(move), colour, opacity - fade, weights], -1)
 
