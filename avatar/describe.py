@@ -148,8 +148,9 @@ def layered_rows(avatar: nn.Module) -> list[Row]:
     rows = rows_of(network, "source", flop, flop, "frame")
     names = {"0": "unet", "1": "out"}
     rows = [row._replace(name=".".join([names[row.name.split(".")[0]], *row.name.split(".")[1:]])) for row in rows]
-    shape = " x ".join(str(extent) for extent in avatar.textures.shape)
-    return [*rows, Row("textures", "", shape, avatar.textures.numel(), 0, 0, "frame")]
+    fading, textures = (" x ".join(str(extent) for extent in part.shape) for part in (avatar.fading, avatar.textures))
+    rows.append(Row("source", "fading", fading, avatar.fading.numel(), 0, 0, "frame"))
+    return [*rows, Row("textures", "", textures, avatar.textures.numel(), 0, 0, "frame")]
 
 
 def layers_of(avatar: nn.Module, head: HeadModel) -> list[Row]:

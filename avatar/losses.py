@@ -23,6 +23,7 @@ ELASTIC_WEIGHTS = (1e-4, 1e-5)
 ELASTIC_FALL = (55_000, 155_000)  # of PAPER_STEPS: Nerfies' 50k constant, then 100k of cosine, after the warp's delay
 MAGNITUDE_WEIGHT = 1e-2
 OUTSIDE_WEIGHT = 1e-2
+# Not swept. With OUTSIDE_WEIGHT, at 100/m from half way to the core; 300/m from 6 mm cost 0.6 dB (nerface.mp4, `demo`, one seed).
 INSIDE_WEIGHT = 1e-2
 KL_WEIGHT = 1e-4  # of the conditional VAE; the paper does not say
 

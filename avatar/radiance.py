@@ -158,11 +158,11 @@ class RadianceAvatar(nn.Module):
             return Outcome(renders, features.terms | terms, evaluations)
         offsets, heads = jitter or [None] * len(rays), range(len(rays))
         found = [sampling.in_shell(posed.grids[i], rays[i], self.step_m, self.max_samples, offsets[i]) for i in heads]
-        met, clear = sum(len(part.ray) for part in found), None
+        met, off_rays = sum(len(part.ray) for part in found), None
         if jitter and met:  # in training: the rays' last random number
-            clear = [self._off_rays(posed, i, jitter[i][:, -1]) for i in heads]
-        rendered, _, terms = self._pass(self.field, features.values, posed, rays, found, precision, window, clear=clear)
-        return Outcome([rendered], features.terms | terms, met + sum(len(part.ray) for part in clear or []))
+            off_rays = [self._off_rays(posed, i, jitter[i][:, -1]) for i in heads]
+        rendered, _, terms = self._pass(self.field, features.values, posed, rays, found, precision, window, off_rays=off_rays)
+        return Outcome([rendered], features.terms | terms, met + sum(len(part.ray) for part in off_rays or []))
 
     def _off_rays(self, posed: Posed, head: int, numbers: np.ndarray) -> Packed:
         """Random places outside the shell of one head and, a quarter, inside its skull; three numbers [N] in [0, 1) for each."""
@@ -213,14 +213,16 @@ class RadianceAvatar(nn.Module):
         precision: torch.dtype,
         window: float | None,
         regularise: bool = True,
-        clear: list[Packed] | None = None,
+        off_rays: list[Packed] | None = None,
     ) -> tuple[Rendered, Tensor, dict[str, Tensor]]:
-        """One network at the samples of all heads. features: [B, V, C]; clear: places of each head where nothing may be.
+        """One network at the samples of all heads. features: [B, V, C]; off_rays: places of each head for OFF_RAYS.
 
         Returns the rays, the weight [P] of each sample, and loss terms: of these places, of the warp unless not asked for.
         """
         firsts = np.cumsum([0, *(len(part.origins_m) for part in rays)])
-        parts = [[sampling.pack(rays[i], found[i], i, firsts[i]), *(clear[i : i + 1] if clear else [])] for i in range(len(rays))]
+        parts = [
+            [sampling.pack(rays[i], found[i], i, firsts[i]), *(off_rays[i : i + 1] if off_rays else [])] for i in range(len(rays))
+        ]
         packed = sampling.join([part for of_head in parts for part in of_head])
         device, vertices = features.device, posed.vertices_m.flatten(0, 1)
         points, directions, distance, step, ray, slot, closed, head = (torch.from_numpy(array).to(device) for array in packed)
@@ -229,17 +231,17 @@ class RadianceAvatar(nn.Module):
         index = torch.from_numpy(self._indices(posed, moved.detach().cpu().numpy(), packed)).to(device)
         terms = field.vertex_terms(features, precision).flatten(0, 1)
         density, colour = field(moved, directions, vertices, index, terms, precision)
-        off_rays, extra = slot < 0, {}
-        if off_rays.any():
+        loose, extra = slot < 0, {}
+        if loose.any():
             extra = {name: term(density[slot == mark]) for name, mark, term in OFF_RAYS if (slot == mark).any()}
             density, colour, distance, step, ray, slot, closed = (
-                array[~off_rays] for array in (density, colour, distance, step, ray, slot, closed)
+                array[~loose] for array in (density, colour, distance, step, ray, slot, closed)
             )
         rendered, weight = composite(density * step + CLOSED * closed, colour, distance, ray, slot, firsts[-1])
         if frame is None or not regularise:
             return rendered, weight, extra
         # Nerfies' own reduction to one sample a ray: the Jacobian at all of them costs ten times as much as all else of the warp.
-        kept = (~off_rays).nonzero()[:, 0]
+        kept = (~loose).nonzero()[:, 0]
         median = kept[torch.from_numpy(sampling.median_samples(weight.detach().cpu().numpy(), ray.cpu().numpy())).to(device)]
         bent = elastic(self.warp.with_jacobian(points[median], frame[median], window)[1])
         return rendered, weight, extra | {"elastic": bent.sum() / max(len(bent), 1), "magnitude": magnitude(points, moved)}

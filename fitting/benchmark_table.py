@@ -171,7 +171,8 @@ def _protocol(rows: Sequence[dict[str, Any]]) -> list[str]:
     lines = [
         f"- {len(rows)} fits took {minutes:.1f} minutes, one after the other, on one thread each: Snakemake gave each fit all "
         f"cores, so that nothing of its own ran beside it{beside}",
-        "- ms a frame: tracking, photometric refinement and temporal bundle; once: calibration on keyframes, whatever the length",
+        "- ms a frame: tracking, photometric refinement and temporal bundle; once, whatever the length: calibration and the "
+        "skin's colours, on keyframes",
         f"- simulated clips ({', '.join(simulated) or 'none'}): at most {SIMULATED_FRAMES} frames, rendered as the config's "
         "`simulate` says, through the real detector and matte; a figure is the median over clips of each clip's median frame",
         f"- real clips ({', '.join(real) or 'none'}): at most {REAL_FRAMES} frames about the split; held-out: error on a fifth "

@@ -103,7 +103,7 @@ def gathered(
 
 
 def _nearest(avatar: LayeredAvatar, disagreement: np.ndarray) -> np.ndarray:
-    """The shell [side, side] on whose colours frames agree best, of those above the skin or a few more [n, side, side].
+    """The shell [side, side] on whose colours frames agree best; disagreement: [n, side, side], the skin's among them.
 
     Over the face it is the skin's, unless another is CLEARER: what frames disagree on there is mostly what expressions change.
     """

@@ -110,9 +110,10 @@ class LayeredAvatar(nn.Module):
         """Take over what `packed` gave. Raises ValueError, RuntimeError or KeyError when it does not fit."""
         self.textures = packing.unpacked_textures(stored["textures"], tuple(self.textures.shape)).to(self.textures.device)
         networks = {name for name in self.state_dict() if name.startswith(LEARNED)}
-        if networks != set(stored["networks"]):
-            raise KeyError(f"the file's network has other layers: {sorted(networks ^ set(stored['networks']))[:3]}")
-        self.load_state_dict(self.state_dict() | {name: value.float() for name, value in stored["networks"].items()})
+        found = {"fading": torch.zeros_like(self.fading)} | stored["networks"]  # files of before it was learned have none
+        if networks != set(found):
+            raise KeyError(f"the file's network has other layers: {sorted(networks ^ set(found))[:3]}")
+        self.load_state_dict(self.state_dict() | {name: value.float() for name, value in found.items()})
         self.thickness_m = stored["thickness_m"].to(self.thickness_m)
         self.offsets_m = stored["offsets_m"].to(self.offsets_m)
 

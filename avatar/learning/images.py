@@ -27,7 +27,7 @@ FACE_SHARE = 0.5  # of the windows are centred on a landmark, the others anywher
 SPREAD_PX = 15.0
 # Learning rates: of the networks, and of the textures' static logits and bases.
 NETWORK_RATE, STATIC_RATE, BASIS_RATE = 1e-3, 0.03, 0.02
-FINAL = 0.1
+FINAL = 0.1  # of the rates, at the last step
 WARM_UP = 100  # steps
 STIR = 0.1  # standard deviation of how far the network's input is moved towards another frame's
 PERCEPTUAL_FROM = 0.15  # of the steps: before, colours alone settle what moves, in steps of less time
