@@ -23,8 +23,6 @@ ELASTIC_WEIGHTS = (1e-4, 1e-5)
 ELASTIC_FALL = (55_000, 155_000)  # of PAPER_STEPS: Nerfies' 50k constant, then 100k of cosine, after the warp's delay
 MAGNITUDE_WEIGHT = 1e-2
 OUTSIDE_WEIGHT = 1e-2
-# Not swept. With OUTSIDE_WEIGHT, at 100/m from half way to the core; 300/m from 6 mm cost 0.6 dB (nerface.mp4, `demo`, one seed).
-INSIDE_WEIGHT = 1e-2
 KL_WEIGHT = 1e-4  # of the conditional VAE; the paper does not say
 
 
@@ -100,8 +98,8 @@ def elastic_weight(step: int, steps: int) -> float:
 
 
 def weight_of(term: str, step: int, steps: int) -> float:
-    """Weight at a step of a loss term: elastic, magnitude (supplement A), kl (`codes_mlp`), outside or inside (`radiance`)."""
-    constant = {"magnitude": MAGNITUDE_WEIGHT, "kl": KL_WEIGHT, "outside": OUTSIDE_WEIGHT, "inside": INSIDE_WEIGHT}
+    """Weight at a step of a loss term: elastic, magnitude (supplement A), kl (`codes_mlp`) or outside (`radiance.clearing`)."""
+    constant = {"magnitude": MAGNITUDE_WEIGHT, "kl": KL_WEIGHT, "outside": OUTSIDE_WEIGHT}
     return elastic_weight(step, steps) if term == "elastic" else constant[term]
 
 

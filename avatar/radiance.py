@@ -40,7 +40,6 @@ from fitting.head_model import HeadModel
 # were tried, toy subject) the first thing learned is to clear it everywhere, and the network dies of it.
 CLEAR = -7.0
 CLEAR_DENSITY = 0.02  # per metre: what is farther away than the shell may have it, half a metre of it lets 99 % of the light pass
-SOLID_DENSITY = 100.0  # per metre, less than half of a new field's: what lies in the skull keeps it
 CANDIDATES = 3  # times the neighbours: as many nearest vertices are looked at for mates
 
 
@@ -69,18 +68,6 @@ def clearing(density: Tensor) -> Tensor:
     gradient is gone long before it is small enough.
     """
     return torch.log(density.clamp_min(CLEAR_DENSITY) / CLEAR_DENSITY).mean()
-
-
-def filling(density: Tensor) -> Tensor:
-    """What is wrong with densities [P] per metre inside the skull: mean of log(SOLID_DENSITY / density), at least 0 each.
-
-    What clears the air takes away what no ray of training has asked for, as the temple of a head that turns at test, and white
-    shines through it (carphone.mp4, `demo`: 0.8 % of the pixels well inside the head had an opacity below 0.9, with this none).
-    """
-    return torch.log(SOLID_DENSITY / density.clamp(1e-6, SOLID_DENSITY)).mean()
-
-
-OFF_RAYS = (("outside", sampling.OUTSIDE_SLOT, clearing), ("inside", sampling.INSIDE_SLOT, filling))
 
 
 class RadianceAvatar(nn.Module):
@@ -158,22 +145,18 @@ class RadianceAvatar(nn.Module):
             return Outcome(renders, features.terms | terms, evaluations)
         offsets, heads = jitter or [None] * len(rays), range(len(rays))
         found = [sampling.in_shell(posed.grids[i], rays[i], self.step_m, self.max_samples, offsets[i]) for i in heads]
-        met, off_rays = sum(len(part.ray) for part in found), None
+        met, clear = sum(len(part.ray) for part in found), None
         if jitter and met:  # in training: the rays' last random number
-            off_rays = [self._off_rays(posed, i, jitter[i][:, -1]) for i in heads]
-        rendered, _, terms = self._pass(self.field, features.values, posed, rays, found, precision, window, off_rays=off_rays)
-        return Outcome([rendered], features.terms | terms, met + sum(len(part.ray) for part in off_rays or []))
+            clear = [self._outside(posed, i, jitter[i][:, -1]) for i in heads]
+        rendered, _, terms = self._pass(self.field, features.values, posed, rays, found, precision, window, clear=clear)
+        return Outcome([rendered], features.terms | terms, met + sum(len(part.ray) for part in clear or []))
 
-    def _off_rays(self, posed: Posed, head: int, numbers: np.ndarray) -> Packed:
-        """Random places outside the shell of one head and, a quarter, inside its skull; three numbers [N] in [0, 1) for each."""
-        few, vertices_m = numbers[: len(numbers) // 3 * 3].reshape(-1, 3), posed.vertices_m[head].cpu().numpy()
-        if not len(self.core_m):
-            return sampling.outside(posed.grids[head], vertices_m, few, head)
-        if self.core_tree is None:
+    def _outside(self, posed: Posed, head: int, numbers: np.ndarray) -> Packed:
+        """Places outside the shell of one head, a random one for each three numbers [N] in [0, 1)."""
+        few = numbers[: len(numbers) // 3 * 3].reshape(-1, 3)
+        if self.core_tree is None and len(self.core_m):
             self.core_tree = cKDTree(self.core_m.cpu().numpy())
-        most = 3 * len(few) // 4
-        outer = sampling.outside(posed.grids[head], vertices_m, few[:most], head, self.core_tree)
-        return sampling.join([outer, sampling.inside(self.core_tree, vertices_m, few[most:, :2], head)])
+        return sampling.outside(posed.grids[head], posed.vertices_m[head].cpu().numpy(), few, head, self.core_tree)
 
     def _coarse_to_fine(
         self,
@@ -213,16 +196,14 @@ class RadianceAvatar(nn.Module):
         precision: torch.dtype,
         window: float | None,
         regularise: bool = True,
-        off_rays: list[Packed] | None = None,
+        clear: list[Packed] | None = None,
     ) -> tuple[Rendered, Tensor, dict[str, Tensor]]:
-        """One network at the samples of all heads. features: [B, V, C]; off_rays: places of each head for OFF_RAYS.
+        """One network at the samples of all heads. features: [B, V, C]; clear: places of each head where nothing may be.
 
         Returns the rays, the weight [P] of each sample, and loss terms: of these places, of the warp unless not asked for.
         """
         firsts = np.cumsum([0, *(len(part.origins_m) for part in rays)])
-        parts = [
-            [sampling.pack(rays[i], found[i], i, firsts[i]), *(off_rays[i : i + 1] if off_rays else [])] for i in range(len(rays))
-        ]
+        parts = [[sampling.pack(rays[i], found[i], i, firsts[i]), *(clear[i : i + 1] if clear else [])] for i in range(len(rays))]
         packed = sampling.join([part for of_head in parts for part in of_head])
         device, vertices = features.device, posed.vertices_m.flatten(0, 1)
         points, directions, distance, step, ray, slot, closed, head = (torch.from_numpy(array).to(device) for array in packed)
@@ -231,17 +212,17 @@ class RadianceAvatar(nn.Module):
         index = torch.from_numpy(self._indices(posed, moved.detach().cpu().numpy(), packed)).to(device)
         terms = field.vertex_terms(features, precision).flatten(0, 1)
         density, colour = field(moved, directions, vertices, index, terms, precision)
-        loose, extra = slot < 0, {}
-        if loose.any():
-            extra = {name: term(density[slot == mark]) for name, mark, term in OFF_RAYS if (slot == mark).any()}
+        outside, extra = slot == sampling.OUTSIDE_SLOT, {}
+        if outside.any():
+            extra = {"outside": clearing(density[outside])}
             density, colour, distance, step, ray, slot, closed = (
-                array[~loose] for array in (density, colour, distance, step, ray, slot, closed)
+                array[~outside] for array in (density, colour, distance, step, ray, slot, closed)
             )
         rendered, weight = composite(density * step + CLOSED * closed, colour, distance, ray, slot, firsts[-1])
         if frame is None or not regularise:
             return rendered, weight, extra
         # Nerfies' own reduction to one sample a ray: the Jacobian at all of them costs ten times as much as all else of the warp.
-        kept = (~loose).nonzero()[:, 0]
+        kept = (~outside).nonzero()[:, 0]
         median = kept[torch.from_numpy(sampling.median_samples(weight.detach().cpu().numpy(), ray.cpu().numpy())).to(device)]
         bent = elastic(self.warp.with_jacobian(points[median], frame[median], window)[1])
         return rendered, weight, extra | {"elastic": bent.sum() / max(len(bent), 1), "magnitude": magnitude(points, moved)}

@@ -14,10 +14,8 @@ from avatar import shell
 from avatar.volume import Rays
 
 MARGIN_M = 0.08  # hair and beard stand off the mesh by no more (as `coverage.LARGEST_M`)
-OUTSIDE_SLOT, INSIDE_SLOT = -1, -2
+OUTSIDE_SLOT = -1
 BESIDE_M = 0.04
-UNDER_M = 0.032  # a vertex farther from the core than this has more than bone between: an ear, a nose, lips, lids
-SKIN_SHARE = 0.5  # of the way from a vertex to the core: 12 mm, by which mesh and skin may differ
 FLOOR = 1e-5  # of the weights that importance sampling follows (NeRF's), so that no stratum is ever without a chance
 
 
@@ -75,7 +73,7 @@ def outside(grid: shell.Grid, vertices_m: np.ndarray, numbers: np.ndarray, head:
 
     numbers: [M, 3] in [0, 1), for a point each: every second is spread evenly over the sphere, the others lie up to BESIDE_M
     from a vertex, where the field has most to forget. They are seen along no direction. core: tree of the core's points: what
-    lies between shell and core is skull.
+    lies between shell and core is skull, and no ray of training may have asked for it.
     """
     centre, radius = ball(vertices_m)
     height, turn = 2 * numbers[:, 1] - 1, 2 * np.pi * numbers[:, 2]
@@ -89,27 +87,9 @@ def outside(grid: shell.Grid, vertices_m: np.ndarray, numbers: np.ndarray, head:
     empty[~empty] = grid.labels[tuple(voxel[~empty].astype(np.int64).T)] == shell.EMPTY
     if core is not None:
         empty[empty] = core.query(points[empty], distance_upper_bound=shell.CORE_DEPTH_M)[0] > shell.CORE_DEPTH_M
-    return _loose(points[empty], OUTSIDE_SLOT, head)
-
-
-def inside(core: cKDTree, vertices_m: np.ndarray, numbers: np.ndarray, head: int = 0) -> Packed:
-    """Points of the skull between skin and core; on no ray: slot INSIDE_SLOT.
-
-    core: tree of the core's points; numbers: [M, 2] in [0, 1), for a vertex each and for a place on the way from it to the core.
-    A vertex farther from the core than UNDER_M has none.
-    """
-    start = vertices_m[(numbers[:, 0] * len(vertices_m)).astype(np.int64)].astype(np.float64)
-    away, nearest = core.query(start)
-    share = SKIN_SHARE + (1 - SKIN_SHARE) * numbers[:, 1:]
-    points = start + share * (core.data[nearest] - start)
-    return _loose(points[away < UNDER_M], INSIDE_SLOT, head)
-
-
-def _loose(points_m: np.ndarray, slot: int, head: int) -> Packed:
-    """Points [M, 3] on no ray, seen along no direction."""
-    points_m = points_m.astype(np.float32)
-    zeros, none = np.zeros(len(points_m), np.float32), np.zeros(len(points_m), np.int64)
-    return Packed(points_m, np.zeros_like(points_m), zeros, zeros, none, none + slot, none > 0, none + head)
+    points, count = points[empty].astype(np.float32), int(empty.sum())
+    zeros, none = np.zeros(count, np.float32), np.zeros(count, np.int64)
+    return Packed(points, np.zeros_like(points), zeros, zeros, none, none + OUTSIDE_SLOT, none > 0, none + head)
 
 
 def uniform(near_m: np.ndarray, far_m: np.ndarray, count: int, jitter: np.ndarray | None) -> shell.Samples:

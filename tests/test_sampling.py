@@ -15,6 +15,7 @@ from avatar import build, sampling, shell
 from avatar.config import TrainConfig
 from avatar.dataset import Scene
 from avatar.volume import Rays
+from fitting.raster import vertex_normals
 
 NEAR, FAR = np.array([0.3, 0.5]), np.array([0.7, 0.6])
 
@@ -134,41 +135,19 @@ def test_training_clears_what_lies_outside_the_shell() -> None:
     assert not avatar.render(posed, [rays], torch.float32).terms
 
 
-def test_places_inside_lie_between_skin_and_core() -> None:
-    random = np.random.default_rng(4)
-    core, vertices = random.normal(size=(30, 3)) * 0.005, random.normal(size=(200, 3)) * 0.02
-    numbers = random.random((500, 2))
-    found = sampling.inside(cKDTree(core), vertices, numbers, 1)
-    expected = []
-    for vertex, share in zip(vertices[(numbers[:, 0] * 200).astype(int)], numbers[:, 1], strict=True):
-        away = np.linalg.norm(core - vertex, axis=1)
-        if away.min() < sampling.UNDER_M:
-            expected.append(vertex + (0.5 + 0.5 * share) * (core[away.argmin()] - vertex))
-    assert 50 < len(expected) < 450 and (found.slot == sampling.INSIDE_SLOT).all() and (found.head == 1).all()
-    np.testing.assert_allclose(found.points_m, expected, atol=1e-6)
-    assert not len(sampling.inside(cKDTree(core), vertices + 1, numbers).ray)
-
-
-@pytest.mark.parametrize("kept", [True, False])
-def test_clearing_the_air_leaves_the_skull_opaque(kept: bool) -> None:
-    """What no ray of training asks for inside the head stays solid; without the term it goes with the air."""
+def test_nothing_is_cleared_beneath_the_shell() -> None:
+    """Between shell and core lies the skull, which no ray of training may have asked for; a head without a core has none."""
     head = toy_head(24, 36)
-    scene = Scene(head, toy_track(head, 2, 40), [0])
-    rows, columns = np.mgrid[:40, :40]
-    rays, random = scene.rays(0, columns.ravel(), rows.ravel()), np.random.default_rng(0)
-    torch.manual_seed(0)
-    avatar = build.build(build.settings_of(TrainConfig(**SMALL)), head)
-    vertices = scene.neutral_m.numpy()
-    core = vertices.mean(0) + 0.65 * (vertices - vertices.mean(0))
-    avatar.shape_shell(torch.full((head.vertex_count,), 0.006), torch.from_numpy(core).float())
-    posed, optimiser = avatar.pose(*scene.heads([0], "cpu")), torch.optim.Adam(avatar.parameters(), 3e-3)
-    for _ in range(40):
-        terms = avatar.render(posed, [rays], torch.float32, [random.random((1600, avatar.jitter_width), dtype=np.float32)]).terms
-        optimiser.zero_grad()
-        (terms["outside"] + kept * terms["inside"]).backward()
-        optimiser.step()
-    assert terms["outside"] < 2
-    assert terms["inside"] < 1 if kept else terms["inside"] > 5
+    vertices = head.template.numpy().astype(np.float64)
+    core = shell.core_points(vertices, vertex_normals(vertices, head.triangles.numpy()))
+    grid, numbers = shell.occupancy(vertices, np.full(len(vertices), 0.008), core), np.random.default_rng(5).random((6000, 3))
+    every, found = sampling.outside(grid, vertices, numbers), sampling.outside(grid, vertices, numbers, core=cKDTree(core))
+    near = lambda points: np.linalg.norm(points[:, None] - core, axis=-1).min(1) <= shell.CORE_DEPTH_M  # noqa: E731
+    beneath = near(every.points_m)
+    assert beneath.sum() > 100 and not near(found.points_m).any()
+    np.testing.assert_array_equal(found.points_m, every.points_m[~beneath])
+    size = np.linalg.norm(found.points_m / (0.075, 0.105, 0.09), axis=1)  # of the toy's ellipsoid
+    assert size.min() > 0.98  # all of them in the air, but for gaps between vertices
 
 
 def test_median_samples_equal_a_loop() -> None:
