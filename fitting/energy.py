@@ -17,8 +17,8 @@ from fitting.landmark_model import LandmarkModel
 from fitting.rig import GAZE, JAW, POSE, Pose, Posed, Surface, jacobian, posed
 
 # Standard deviation of the lid gap of a shut eye over that of an open one; in between by how open it looks (`observed`).
-# nerface.mp4, lids shut: 6 px of gap were left, 4 px with this and the stronger photometric term.
-SHUT_SIGMA = 0.25
+# Tighter (0.25), lids on the far side that are only guessed to be shut turn the head (`tests/test_hard_landmarks.py`, case 3).
+SHUT_SIGMA = 0.5
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ SAMPLES = 2000
 PIXEL_ITERATIONS = 3  # a level of the photometric pyramid
 APPEARANCE_ROUNDS = 3  # the skin is learned from the keyframes as landmarks place them, then as their own pixels do
 SILHOUETTE_ROUNDS = 3  # the rim is found anew this often
-STRENGTH = Strength(photometric=0.1, photometric_robust=3.0, silhouette=0.05, silhouette_sigma=0.01, silhouette_robust=3.0)
+STRENGTH = Strength(photometric=0.02, photometric_robust=3.0, silhouette=0.05, silhouette_sigma=0.01, silhouette_robust=3.0)
 
 
 def weights(terms: TermWeights) -> Weights:
