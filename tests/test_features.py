@@ -79,9 +79,13 @@ def test_a_table_is_added_where_the_settings_ask(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_features_start_at_a_comparable_scale(name: str) -> None:
-    """Of what is learned: codes are appended as they are. The U-Net keeps the size of what it reads."""
+    """Of what is learned: codes are appended as they are. The U-Net keeps the size of what it reads and tells frames apart."""
     values = source_of(name, static_features=False)(condition(4)).values[..., :64]
-    assert 0.5 * FEATURE_SCALE < root_mean_square(values) < (6 if name == "ours_d" else 2) * FEATURE_SCALE
+    if name == "ours_d":
+        assert 2 * FEATURE_SCALE < root_mean_square(values) < 6 * FEATURE_SCALE
+        assert root_mean_square(values - values.mean(0)) > 0.3 * root_mean_square(values)
+    else:
+        assert 0.5 * FEATURE_SCALE < root_mean_square(values) < 2 * FEATURE_SCALE
 
 
 @pytest.mark.parametrize("name", SOURCES)

@@ -140,11 +140,11 @@ def test_nothing_is_cleared_beneath_the_shell() -> None:
     head = toy_head(24, 36)
     vertices = head.template.numpy().astype(np.float64)
     core = shell.core_points(vertices, vertex_normals(vertices, head.triangles.numpy()))
-    grid, numbers = shell.occupancy(vertices, np.full(len(vertices), 0.008), core), np.random.default_rng(5).random((6000, 3))
+    grid, numbers = shell.occupancy(vertices, np.full(len(vertices), 0.008), core), np.random.default_rng(5).random((2000, 3))
     every, found = sampling.outside(grid, vertices, numbers), sampling.outside(grid, vertices, numbers, core=cKDTree(core))
     near = lambda points: np.linalg.norm(points[:, None] - core, axis=-1).min(1) <= shell.CORE_DEPTH_M  # noqa: E731
     beneath = near(every.points_m)
-    assert beneath.sum() > 100 and not near(found.points_m).any()
+    assert beneath.sum() > 40 and not near(found.points_m).any()
     np.testing.assert_array_equal(found.points_m, every.points_m[~beneath])
     size = np.linalg.norm(found.points_m / (0.075, 0.105, 0.09), axis=1)  # of the toy's ellipsoid
     assert size.min() > 0.98  # all of them in the air, but for gaps between vertices
@@ -194,9 +194,9 @@ def test_a_hierarchical_avatar_trains_both_networks_and_renders_the_fine_one(tmp
 
 def test_a_hierarchical_avatar_does_not_end_in_white(tmp_path: Path) -> None:
     keys = {"coarse_samples": 16, "fine_samples": 16, "rays": 256, "mlp_width": 32, "learning_rate": 1e-3, "opacity_weight": 0.0}
-    outputs = train_in(tmp_path, write_subject(tmp_path), steps=70, sampling="hierarchical", **keys)
+    outputs = train_in(tmp_path, write_subject(tmp_path), steps=130, sampling="hierarchical", **keys)
     quality = [float(line.split("\t")[3]) for line in outputs["curve"].read_text().splitlines()[1:]]
-    assert quality[-1] > 12.5  # white is 11.2 dB, and what an avatar without the squared steps at the start becomes
+    assert quality[-1] > 14  # white is 11.2 dB, and what an avatar without the squared steps at the start becomes
 
 
 def test_both_networks_get_gradients_and_the_shell_needs_one() -> None:
