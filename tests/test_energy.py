@@ -126,6 +126,10 @@ def test_the_eyelid_term_sees_the_gap_alone(model, made):
     hidden = replace(frame, points=points, weight=np.where(np.arange(len(model.ids)) == model.lids[1, 0, 0], 0.0, 1.0))
     facing = energy.facing(model.surface.normal[model.lids[0, 1, :1]], pose)[0]
     assert energy.eyelid_rows(folded, hidden, WEIGHTS, LENS, at).cost == pytest.approx(0.5 * facing, rel=1e-9)
+    for open_eyes, tighter in (([0.0, 1.0], 1 / energy.SHUT_SIGMA), ([1.0, 0.0], 1.0), ([0.5, 1.0], 2 / (1 + energy.SHUT_SIGMA))):
+        shut = replace(hidden, open_eyes=np.array(open_eyes))  # the left eye's gap is the one that is off
+        cost = energy.eyelid_rows(folded, shut, WEIGHTS, LENS, at).cost
+        assert cost == pytest.approx(0.5 * facing * tighter**2, rel=1e-9)
 
 
 def test_huber_is_continuous_and_bounds_the_influence():
