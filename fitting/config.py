@@ -100,9 +100,7 @@ class TermWeights(StepConfig):
     landmarks: float = Field(1.0, gt=0, le=100, description="Detected landmarks, brows, nose, lips and outline.")
     irises: float = Field(1.0, ge=0, le=100, description="Iris centres among the landmarks: the gaze.")
     eyelids: float = Field(1.0, ge=0, le=100, description="Gap between the lids: blinks.")
-    photometric: float = Field(
-        1.0, ge=0, le=100, description="Skin keeps its colour from frame to frame; 5 tells lids and brows better, the pose worse."
-    )
+    photometric: float = Field(1.0, ge=0, le=100, description="Skin keeps its colour from frame to frame: lids, brows, wrinkles.")
     silhouette: float = Field(1.0, ge=0, le=100, description="Skull, ears and jaw against the edge of the matte.")
     priors: float = Field(1.0, ge=0, le=100, description="Expression near the detector's own scores.")
     temporal: float = Field(1.0, ge=0, le=100, description="Accelerations: closes the seams between blocks, calms jitter.")

@@ -72,6 +72,7 @@ class Rows:
     residual: np.ndarray  # [M]
     parts: tuple[tuple[np.ndarray, np.ndarray], ...]  # (covector [M, 3], point [M]): the residual moves with each of these points
     nuisance: np.ndarray | None = None  # [M, N] weighted columns of unknowns that are eliminated (gain, bias)
+    kept: np.ndarray | None = None  # [N] part of each column's own direction (beyond those before it) that stays; None: nothing
 
 
 @dataclass(frozen=True)
@@ -230,15 +231,23 @@ def eliminated(rows: Rows) -> Rows:
     if rows.nuisance is None or not len(rows.residual):
         return rows
     basis, triangle = np.linalg.qr(rows.nuisance)
-    basis = basis[:, np.abs(np.diag(triangle)) > 1e-9 * max(1e-30, np.abs(triangle).max())]
+    size = np.abs(np.diag(triangle))
+    own = size > 1e-6 * np.maximum(1e-30, np.linalg.norm(triangle, axis=0))  # columns of any units, read from float32 pictures
+    kept = (np.zeros(len(own)) if rows.kept is None else rows.kept)[own]
+    if not own.all():  # those after a column that says nothing new must not be made orthogonal to its rounding errors
+        basis = np.linalg.qr(rows.nuisance[:, own])[0]
     amount = basis.T @ rows.residual
-    return replace(rows, residual=rows.residual - basis @ amount, nuisance=basis, cost=rows.cost - 0.5 * float(amount @ amount))
+    residual = rows.residual - basis @ ((1 - kept) * amount)
+    return replace(rows, residual=residual, nuisance=basis, kept=kept, cost=rows.cost - 0.5 * float((1 - kept**2) @ amount**2))
 
 
 def row_jacobian(at: Posed, rows: Rows) -> np.ndarray:
     """Jacobian [M, d] of a term's rows, nuisance unknowns eliminated."""
     columns = sum(jacobian(at, covector, point) for covector, point in rows.parts)
-    return columns if rows.nuisance is None else columns - rows.nuisance @ (rows.nuisance.T @ columns)
+    if rows.nuisance is None:
+        return columns
+    lost = 1 if rows.kept is None else (1 - rows.kept)[:, None]
+    return columns - rows.nuisance @ (lost * (rows.nuisance.T @ columns))
 
 
 def free_unknowns(model: LandmarkModel, pose_only: bool = False, actions: np.ndarray | None = None) -> np.ndarray:

@@ -18,7 +18,7 @@ from numba import njit
 from fitting import camera, raster
 from fitting.energy import Camera, Rows, huber
 from fitting.head_model import REGIONS
-from fitting.rig import Pose, Posed, Rig, Surface, posed
+from fitting.rig import POSE, Pose, Posed, Rig, Surface, posed
 
 SAMPLED = ("face", "ears")
 DEPTH_TOLERANCE_M = 0.004
@@ -153,13 +153,25 @@ def weights_of(surface: Surface, pose: Pose, seen: np.ndarray) -> np.ndarray:
 
 
 def photometric_rows(
-    picture: Level, colour: np.ndarray, weight: np.ndarray, sigma: float, strength: float, lens: Camera, robust: float, at: Posed
+    picture: Level,
+    colour: np.ndarray,
+    weight: np.ndarray,
+    sigma: float,
+    strength: float,
+    lens: Camera,
+    robust: float,
+    at: Posed,
+    rigid: float = 1.0,
 ) -> Rows:
     """Difference between a frame's picture and the samples' shaded colours, gain and offset of the frame eliminated.
 
+    What a motion of all samples together explains may count less than the rest: with a wrong identity or focal length the
+    skin's colours sit a little wrong in every view, which should not turn the head; lids, brows and lips move against the rest.
+
     Args:
         picture: one pyramid level; colour: [P] albedo times light, NaN where unknown; weight: [P]; sigma: grey values;
-        strength: how much the whole term counts (a sum of weights of this size is one landmark's worth, see `fitting.settings`).
+        strength: how much the whole term counts (a sum of weights of this size is one landmark's worth, see `fitting.settings`);
+        rigid: strength, relative to that, of what a rigid motion of the samples explains, in [0, 1].
     """
     pixel = camera.project(at.points, lens.focal_px, lens.centre_px)
     value, inside = read(picture, pixel)
@@ -175,7 +187,12 @@ def photometric_rows(
     slope = value[used, 1:] / sigma * factor[:, None]
     covector = np.einsum("pi,pij->pj", slope, camera.project_jacobian(at.points[used], lens.focal_px))
     total = float((cost * weight[used]).sum() * strength)
-    return Rows(total, away * factor, ((covector, used),), columns * (factor / sigma)[:, None])
+    columns = columns * (factor / sigma)[:, None]
+    if rigid == 1:
+        return Rows(total, away * factor, ((covector, used),), columns)
+    moved = np.concatenate([np.cross(at.points[used] - at.pose.translation, covector), covector], 1)
+    kept = np.sqrt(np.repeat([0.0, rigid], [columns.shape[1], POSE]))
+    return Rows(total, away * factor, ((covector, used),), np.concatenate([columns, moved], 1), kept)
 
 
 def robust_gain(columns: np.ndarray, value: np.ndarray, root: np.ndarray, sigma: float, robust: float) -> np.ndarray:

@@ -82,10 +82,9 @@ def fit_clip(clip: Clip, config: FitConfig, bar: Bar = lambda rows, _: rows, hel
     if pictures is not None:
         with _timed(seconds, "appearance"):
             calibration = _with_silhouette(clip, config, pictures, calibration, weights)
-    shared = calibration.state
     with _timed(seconds, "track"):
         tracker = stages.Tracker(
-            clip.model, clip.observed, weights, shared, calibration.actions, calibration.held, _solver(config)
+            clip.model, clip.observed, weights, calibration.state, calibration.actions, calibration.held, _solver(config)
         )
         state, reinit = _track(clip, config, tracker, bar)
     looks: dict[int, Look] = {}
@@ -134,8 +133,9 @@ def _solver(config: FitConfig) -> stages.Solve:
 def _pictures(clip: Clip, config: FitConfig) -> Pictures | None:
     if not (config.weights.photometric or config.weights.silhouette):
         return None
-    strength = settings.strength(config.weights)
-    return Pictures(clip.rig, clip.frames, clip.alpha, clip.observed.scale_px, strength, settings.SAMPLES)
+    return Pictures(
+        clip.rig, clip.frames, clip.alpha, clip.observed.scale_px, settings.strength(config.weights), settings.SAMPLES
+    )
 
 
 def _calibrate(clip: Clip, config: FitConfig, good: np.ndarray) -> tuple[Calibration, energy.Weights]:
@@ -143,9 +143,8 @@ def _calibrate(clip: Clip, config: FitConfig, good: np.ndarray) -> tuple[Calibra
     weights = settings.weights(config.weights)
     if config.focal_px is not None:
         weights = replace(weights, log_focal_sd=1e-3)
-    blank = neutral(clip.model, 1, clip.log_focal)
     sharpness = _sharpness(clip, good)
-    poses = stages.pnp(clip.model, clip.observed, good, blank)
+    poses = stages.pnp(clip.model, clip.observed, good, neutral(clip.model, 1, clip.log_focal))
     keyframes = calibrate.choose_keyframes(clip.observed, good, poses, sharpness, config.keyframes)
     calibration = calibrate.calibrate(
         clip.model, clip.observed, keyframes, weights, clip.log_focal, settings.BIAS_SD_M, settings.MAX_FOCAL_SD
@@ -170,8 +169,7 @@ def _sharpness(clip: Clip, rows: np.ndarray) -> np.ndarray:
     out = np.zeros(len(clip.frames))
     for row in rows:
         points = clip.observed.points[row]
-        low = np.clip(points.min(0).astype(int), 0, None)
-        high = points.max(0).astype(int) + 1
+        low, high = np.clip(points.min(0).astype(int), 0, None), points.max(0).astype(int) + 1
         box = cv2.cvtColor(np.ascontiguousarray(clip.frames[row][low[1] : high[1], low[0] : high[0]]), cv2.COLOR_RGB2GRAY)
         out[row] = cv2.Laplacian(cv2.resize(box, (128, 128), interpolation=cv2.INTER_AREA), cv2.CV_32F).var()
     return out
@@ -198,27 +196,34 @@ def _track(clip: Clip, config: FitConfig, tracker: stages.Tracker, bar: Bar) -> 
 
 
 def _problem(
-    clip: Clip, tracker: stages.Tracker, pictures: Pictures | None, look: Look | None, row: int, pose: Pose, level: int
+    clip: Clip,
+    tracker: stages.Tracker,
+    pictures: Pictures | None,
+    look: Look | None,
+    row: int,
+    pose: Pose,
+    level: int,
+    learning: bool,
 ) -> Problem:
-    """All terms of one frame around a pose; those that read pixels where there is a look."""
+    """All terms of one frame around a pose; those that read pixels where there is a look. learning: see `pictures.Strength`."""
     problem = tracker.problem(row, pose.gaze)
     if look is None:
         return problem
     shape, lens = tracker.shared.shape, tracker.lens
-    extra = pictures.photometric_terms(row, look, shape, lens, (level,)) + pictures.silhouette_terms(row, look, shape, lens)
-    return replace(problem, terms=(*problem.terms, *extra))
+    seen = pictures.photometric_terms(row, look, shape, lens, (level,), learning)
+    return replace(problem, terms=(*problem.terms, *seen, *pictures.silhouette_terms(row, look, shape, lens)))
 
 
 def _learn(clip: Clip, keyframes: np.ndarray, tracker: stages.Tracker, pictures: Pictures, state: State) -> None:
     """What the skin looks like: from the keyframes as the landmarks place them, then as their own pixels do."""
     pictures.learn(keyframes, state.frames(keyframes), tracker.lens)
     for _ in range(settings.APPEARANCE_ROUNDS - 1):
-        state, _ = _refine(clip, tracker, pictures, state, keyframes, lambda rows, _: rows)
+        state, _ = _refine(clip, tracker, pictures, state, keyframes, lambda rows, _: rows, learning=True)
         pictures.learn(keyframes, state.frames(keyframes), tracker.lens)
 
 
 def _refine(
-    clip: Clip, tracker: stages.Tracker, pictures: Pictures, state: State, rows: np.ndarray, bar: Bar
+    clip: Clip, tracker: stages.Tracker, pictures: Pictures, state: State, rows: np.ndarray, bar: Bar, learning: bool = False
 ) -> tuple[State, dict[int, Look]]:
     """Some frames again with their pixels, coarse level first; frames do not read each other."""
     poses = [state.pose(row) for row in range(len(state))]
@@ -227,7 +232,7 @@ def _refine(
     for row in bar(rows, "pixels"):
         looks[row] = pictures.look(row, poses[row], tracker.shared.shape, tracker.lens)
         for level in levels:
-            problem = _problem(clip, tracker, pictures, looks[row], row, poses[row], level)
+            problem = _problem(clip, tracker, pictures, looks[row], row, poses[row], level, learning)
             poses[row] = solver.solve_frame(problem, poses[row], settings.PIXEL_ITERATIONS)[0]
     return state.with_poses(poses), looks
 
@@ -250,7 +255,7 @@ def _bundle(
         def problem_of(k: int, at: State, part: np.ndarray = part) -> Problem | None:
             if not clip.observed.found[part[k]]:
                 return None
-            return _problem(clip, tracker, pictures, looks.get(part[k]), part[k], at.pose(k), FINEST)
+            return _problem(clip, tracker, pictures, looks.get(part[k]), part[k], at.pose(k), FINEST, False)
 
         stencil = bundle.stencils(clip.time_s[part], cut[part])
         bundled, _ = bundle.smooth(problem_of, state.frames(part), stencil, smoothness, settings.BUNDLE_ITERATIONS)

@@ -135,10 +135,14 @@ def head_and_neck(
     keep = np.clip((limit[column] - along) / max(fade_px, 1.0) + 0.5, 0, 1)
     trimmed = alpha * keep
     count, label = cv2.connectedComponents((trimmed > 127).astype(np.uint8), connectivity=4)
-    if count > 2:  # what the cut has parted from the head: shoulders beside it, a hand
+    if count > 2:  # what the cut has parted from the head: shoulders beside it, a hand; strands of hair end above it
         touching = np.bincount(label[mesh], minlength=count)
         touching[0] = 0
-        others = (label > 0) & (touching[label] < 0.1 * touching.max())
+        deepest = np.full(count, -np.inf)
+        np.maximum.at(deepest, label.ravel(), along.ravel())
+        parted = (touching < 0.1 * touching.max()) & (deepest > mouth - 2 * fade_px)
+        parted[0] = False
+        others = parted[label]
         trimmed = trimmed * (cv2.dilate(others.astype(np.uint8), np.ones((7, 7), np.uint8)) == 0)
     return np.round(trimmed).astype(np.uint8)
 

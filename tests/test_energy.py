@@ -241,6 +241,24 @@ def test_elimination_equals_solving_all_together(model, scale):
     np.testing.assert_allclose(gradient, differences(lambda p: problem.evaluate(p)[0], pose) * free, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("kept", [0.0, 0.3, 1.0])
+def test_a_part_that_is_kept_is_a_weaker_term_beside_the_eliminated_one(model, kept):
+    """Rows that keep a part k of a column's direction are k^2 of the plain term and 1 - k^2 of the one without that direction."""
+    term, own = nuisance_term(model)
+    pose = random_pose(3, 1)
+    at = posed(model.surface, pose)
+    plain, without = replace(term.rows(at), nuisance=None), energy.eliminated(term.rows(at))
+    mixed = energy.eliminated(replace(term.rows(at), kept=np.full(own.shape[1], kept)))
+    assert mixed.cost == pytest.approx(kept**2 * plain.cost + (1 - kept**2) * without.cost, rel=1e-12)
+
+    def normal(rows):
+        columns = energy.row_jacobian(at, rows)
+        return np.concatenate([columns.T @ columns, (columns.T @ rows.residual)[:, None]], 1)
+
+    np.testing.assert_allclose(normal(mixed), kept**2 * normal(plain) + (1 - kept**2) * normal(without), atol=1e-9)
+    assert energy.eliminated(replace(term.rows(at), kept=np.array([0.0, kept]))).cost <= mixed.cost + 1e-12
+
+
 def test_nuisance_columns_that_say_the_same_count_once(model):
     term, own = nuisance_term(model, 1)
     at = posed(model.surface, random_pose(3, 1))

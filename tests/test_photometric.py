@@ -1,6 +1,7 @@
 """The photometric term: reading pictures, visibility, light, and the pull that it has on a shifted head."""
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -137,6 +138,25 @@ def test_gradient_against_differences(made, robust):
         problem.gradient(moved, evaluated), expected, rtol=tolerance, atol=tolerance * np.abs(expected).max()
     )
     assert cost > 1
+
+
+def test_a_head_that_turns_as_a_whole_is_told_less_than_lids_that_move(made):
+    """With rigid=0 the term says nothing about pose; with 1 all; in between it is the weighted mean of both."""
+    rig, _, truth, *_ = made
+    random = np.random.default_rng(0)
+    surface, level, pose = photometric.choose_samples(rig, 300).surface, ramp(), truth.pose(1)
+    value = photometric.read(level, camera.project(posed(surface, pose).points, LENS.focal_px, LENS.centre_px))[0][:, 0]
+    colour, weight = 0.7 * value + 20 + random.normal(0, 4, 300), random.uniform(0.1, 1, 300)
+    told, moved = {}, pose.moved(random.normal(0, 0.005, D))
+    for rigid in (0.0, 0.2, 1.0):
+        rows = partial(photometric.photometric_rows, level, colour, weight, 3.0, 0.1, LENS, 1e9, rigid=rigid)
+        problem = problem_of(rows, surface)
+        cost, evaluated = problem.evaluate(moved)
+        told[rigid] = cost, *problem.normal(moved, evaluated)
+    assert np.abs(told[0.0][1][:6, :6]).max() < 1e-8 * np.abs(told[1.0][1][:6, :6]).max()
+    for mixed, none, all_ in zip(told[0.2], told[0.0], told[1.0], strict=True):
+        np.testing.assert_allclose(mixed, 0.8 * none + 0.2 * all_, atol=1e-6 * np.abs(all_).max())
+    assert told[0.0][1][10, 10] > 0  # an expression is told
 
 
 def test_exposure_changes_nothing(made):

@@ -43,6 +43,14 @@ def test_a_shoulder_raised_to_the_chin_goes():
     assert trimmed[118:, :50].max() == 0
 
 
+def test_a_strand_apart_from_the_head_stays():
+    """A tuft's strands are islands of the matte beside the mesh: above the mouth nothing was cut from them."""
+    alpha, mesh, face, down, _ = person()
+    alpha[5:9, 100:130], alpha[60:64, 140:160] = 255, 255
+    trimmed = head_and_neck(alpha, mesh, face, down, 8.0, 2.0, 20.0)
+    assert (trimmed[:90] == alpha[:90]).all()
+
+
 def test_soft_edges_stay_soft():
     alpha, mesh, face, down, _ = person()
     alpha[18:22, 80:100] = 90
