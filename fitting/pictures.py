@@ -23,7 +23,6 @@ class Strength:
     photometric: float  # of one sample against one landmark of standard deviation 1: neighbouring samples err together
     photometric_robust: float  # Huber's threshold in standard deviations
     photometric_rigid: float  # strength, relative to that, of what a rigid motion of all samples explains
-    photometric_learning: float  # instead of both, of everything, while the skin's colours are still being learned
     silhouette: float  # of one point of the rim
     silhouette_sigma: float  # of the matte's edge, in inter-ocular distances
     silhouette_robust: float
@@ -146,16 +145,14 @@ class Pictures:
         term = silhouette.term_of(look.rim, look.edge, shape, sigma, strength.silhouette, lens, strength.silhouette_robust)
         return [term]
 
-    def photometric_terms(
-        self, row: int, look: Look, shape: np.ndarray, lens: Camera, levels: Sequence[int], learning: bool = False
-    ) -> list[Term]:
-        """The photometric term of one frame at some pyramid levels; none where it is off. learning: see `Strength`."""
+    def photometric_terms(self, row: int, look: Look, shape: np.ndarray, lens: Camera, levels: Sequence[int]) -> list[Term]:
+        """The photometric term of one frame at some pyramid levels; none where it is off."""
         if self.appearance is None:
             return []
         _, samples = self.fold(shape)
         pyramid = photometric.pyramid(self.frames[row], look.pixels, self.scale_px[row], levels)
         strength, appearance = self.strength, self.appearance
-        amount, rigid = (strength.photometric_learning, 1.0) if learning else (strength.photometric, strength.photometric_rigid)
+        amount, rigid = strength.photometric, strength.photometric_rigid
 
         def one(picture: photometric.Level, level: int) -> Term:
             colour, sigma = appearance.albedo[level] * look.shade, appearance.sigma[level]

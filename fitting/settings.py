@@ -44,13 +44,11 @@ ANOTHER_FACE = 2.5  # a stretch between two cuts whose median error is this many
 LOST_OF_MEDIAN, LOST_OF_EYES = 4.0, 0.05  # a frame this much worse than the median, and this bad, is lost
 SAMPLES = 2000
 PIXEL_ITERATIONS = 3  # a level of the photometric pyramid
-APPEARANCE_ROUNDS = 2  # the skin is learned from the keyframes as landmarks place them, then as their own pixels do
 SILHOUETTE_ROUNDS = 3  # the rim is found anew this often
 STRENGTH = Strength(
-    photometric=0.09,  # stronger, lids close further and brows follow wrinkles, but the head turns with what the shape has wrong
+    photometric=0.08,  # stronger, lids close further and brows follow wrinkles, but the head turns with what the shape has wrong
     photometric_robust=3.0,
-    photometric_rigid=0.05,
-    photometric_learning=0.02,
+    photometric_rigid=0.3,
     silhouette=0.05,
     silhouette_sigma=0.01,
     silhouette_robust=3.0,
@@ -74,6 +72,5 @@ def strength(terms: TermWeights) -> Strength:
     return replace(
         STRENGTH,
         photometric=STRENGTH.photometric * terms.photometric,
-        photometric_learning=STRENGTH.photometric_learning * terms.photometric,
         silhouette=STRENGTH.silhouette * terms.silhouette,
     )

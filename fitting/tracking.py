@@ -82,16 +82,17 @@ def fit_clip(clip: Clip, config: FitConfig, bar: Bar = lambda rows, _: rows, hel
     if pictures is not None:
         with _timed(seconds, "appearance"):
             calibration = _with_silhouette(clip, config, pictures, calibration, weights)
+    shared = calibration.state
     with _timed(seconds, "track"):
         tracker = stages.Tracker(
-            clip.model, clip.observed, weights, calibration.state, calibration.actions, calibration.held, _solver(config)
+            clip.model, clip.observed, weights, shared, calibration.actions, calibration.held, _solver(config)
         )
         state, reinit = _track(clip, config, tracker, bar)
     looks: dict[int, Look] = {}
     if pictures is not None:
         if config.weights.photometric:
             with _timed(seconds, "appearance"):
-                _learn(clip, calibration.keyframes, tracker, pictures, state)
+                pictures.learn(calibration.keyframes, state.frames(calibration.keyframes), tracker.lens)
         with _timed(seconds, "pixels"):
             state, looks = _refine(clip, tracker, pictures, state, np.flatnonzero(found), bar)
     cut = bundle.cuts(state, found)
@@ -133,9 +134,8 @@ def _solver(config: FitConfig) -> stages.Solve:
 def _pictures(clip: Clip, config: FitConfig) -> Pictures | None:
     if not (config.weights.photometric or config.weights.silhouette):
         return None
-    return Pictures(
-        clip.rig, clip.frames, clip.alpha, clip.observed.scale_px, settings.strength(config.weights), settings.SAMPLES
-    )
+    strength = settings.strength(config.weights)
+    return Pictures(clip.rig, clip.frames, clip.alpha, clip.observed.scale_px, strength, settings.SAMPLES)
 
 
 def _calibrate(clip: Clip, config: FitConfig, good: np.ndarray) -> tuple[Calibration, energy.Weights]:
@@ -143,8 +143,9 @@ def _calibrate(clip: Clip, config: FitConfig, good: np.ndarray) -> tuple[Calibra
     weights = settings.weights(config.weights)
     if config.focal_px is not None:
         weights = replace(weights, log_focal_sd=1e-3)
+    blank = neutral(clip.model, 1, clip.log_focal)
     sharpness = _sharpness(clip, good)
-    poses = stages.pnp(clip.model, clip.observed, good, neutral(clip.model, 1, clip.log_focal))
+    poses = stages.pnp(clip.model, clip.observed, good, blank)
     keyframes = calibrate.choose_keyframes(clip.observed, good, poses, sharpness, config.keyframes)
     calibration = calibrate.calibrate(
         clip.model, clip.observed, keyframes, weights, clip.log_focal, settings.BIAS_SD_M, settings.MAX_FOCAL_SD
@@ -169,7 +170,8 @@ def _sharpness(clip: Clip, rows: np.ndarray) -> np.ndarray:
     out = np.zeros(len(clip.frames))
     for row in rows:
         points = clip.observed.points[row]
-        low, high = np.clip(points.min(0).astype(int), 0, None), points.max(0).astype(int) + 1
+        low = np.clip(points.min(0).astype(int), 0, None)
+        high = points.max(0).astype(int) + 1
         box = cv2.cvtColor(np.ascontiguousarray(clip.frames[row][low[1] : high[1], low[0] : high[0]]), cv2.COLOR_RGB2GRAY)
         out[row] = cv2.Laplacian(cv2.resize(box, (128, 128), interpolation=cv2.INTER_AREA), cv2.CV_32F).var()
     return out
@@ -196,34 +198,19 @@ def _track(clip: Clip, config: FitConfig, tracker: stages.Tracker, bar: Bar) -> 
 
 
 def _problem(
-    clip: Clip,
-    tracker: stages.Tracker,
-    pictures: Pictures | None,
-    look: Look | None,
-    row: int,
-    pose: Pose,
-    level: int,
-    learning: bool,
+    clip: Clip, tracker: stages.Tracker, pictures: Pictures | None, look: Look | None, row: int, pose: Pose, level: int
 ) -> Problem:
-    """All terms of one frame around a pose; those that read pixels where there is a look. learning: see `pictures.Strength`."""
+    """All terms of one frame around a pose; those that read pixels where there is a look."""
     problem = tracker.problem(row, pose.gaze)
     if look is None:
         return problem
     shape, lens = tracker.shared.shape, tracker.lens
-    seen = pictures.photometric_terms(row, look, shape, lens, (level,), learning)
-    return replace(problem, terms=(*problem.terms, *seen, *pictures.silhouette_terms(row, look, shape, lens)))
-
-
-def _learn(clip: Clip, keyframes: np.ndarray, tracker: stages.Tracker, pictures: Pictures, state: State) -> None:
-    """What the skin looks like: from the keyframes as the landmarks place them, then as their own pixels do."""
-    pictures.learn(keyframes, state.frames(keyframes), tracker.lens)
-    for _ in range(settings.APPEARANCE_ROUNDS - 1):
-        state, _ = _refine(clip, tracker, pictures, state, keyframes, lambda rows, _: rows, learning=True)
-        pictures.learn(keyframes, state.frames(keyframes), tracker.lens)
+    extra = pictures.photometric_terms(row, look, shape, lens, (level,)) + pictures.silhouette_terms(row, look, shape, lens)
+    return replace(problem, terms=(*problem.terms, *extra))
 
 
 def _refine(
-    clip: Clip, tracker: stages.Tracker, pictures: Pictures, state: State, rows: np.ndarray, bar: Bar, learning: bool = False
+    clip: Clip, tracker: stages.Tracker, pictures: Pictures, state: State, rows: np.ndarray, bar: Bar
 ) -> tuple[State, dict[int, Look]]:
     """Some frames again with their pixels, coarse level first; frames do not read each other."""
     poses = [state.pose(row) for row in range(len(state))]
@@ -232,7 +219,7 @@ def _refine(
     for row in bar(rows, "pixels"):
         looks[row] = pictures.look(row, poses[row], tracker.shared.shape, tracker.lens)
         for level in levels:
-            problem = _problem(clip, tracker, pictures, looks[row], row, poses[row], level, learning)
+            problem = _problem(clip, tracker, pictures, looks[row], row, poses[row], level)
             poses[row] = solver.solve_frame(problem, poses[row], settings.PIXEL_ITERATIONS)[0]
     return state.with_poses(poses), looks
 
@@ -255,7 +242,7 @@ def _bundle(
         def problem_of(k: int, at: State, part: np.ndarray = part) -> Problem | None:
             if not clip.observed.found[part[k]]:
                 return None
-            return _problem(clip, tracker, pictures, looks.get(part[k]), part[k], at.pose(k), FINEST, False)
+            return _problem(clip, tracker, pictures, looks.get(part[k]), part[k], at.pose(k), FINEST)
 
         stencil = bundle.stencils(clip.time_s[part], cut[part])
         bundled, _ = bundle.smooth(problem_of, state.frames(part), stencil, smoothness, settings.BUNDLE_ITERATIONS)
