@@ -14,6 +14,7 @@ import torch
 from scipy import ndimage
 
 from avatar.dataset import Scene
+from avatar.layered import outlines
 from avatar.layered.model import LayeredAvatar
 from fitting.head_model import REGIONS
 
@@ -26,6 +27,8 @@ AGREEING = 4.0  # texels over which the frames' agreement on a colour is average
 OUTSIDE = 2.0  # below what the matte's own mean says, beside the head
 CLEARER = 0.6  # part of the skin's disagreement below which another shell is taken for the surface of the face
 STANDS_OFF_M = 0.0045  # reach of the shells above which something stands off the mesh
+COVERED_M = 0.004  # height of the surface from which what is seen there is not skin
+STAYS = -0.16  # `fading` of a shell that fades to a third
 LIMIT = 0.02  # colours are kept this far from 0 and 1: their logits are finite
 DETAIL = 4  # the principal components are found at a texture's side over this
 COARSE = 4.0  # texels of such a texture over which the coarse part is blurred
@@ -102,6 +105,11 @@ def gathered(
     return sums, singles
 
 
+def at_surface(layers: int) -> int:
+    """Number of the shell just beneath the surface that `settle` finds, of so many layers; see `shells.around`."""
+    return max(layers - 5, 0)
+
+
 def _nearest(avatar: LayeredAvatar, disagreement: np.ndarray) -> np.ndarray:
     """The shell [side, side] on whose colours frames agree best; disagreement: [n, side, side], the skin's among them.
 
@@ -115,9 +123,11 @@ def _nearest(avatar: LayeredAvatar, disagreement: np.ndarray) -> np.ndarray:
 
 
 def settle(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.ndarray, chosen: Sequence[int]) -> None:
-    """Move the shells to the surface of what stands off the skin, in place: a plane sweep (Collins, 1996), shells as planes.
+    """Move the shells to the surface of what stands off the skin, in place.
 
-    Arrays as for `gathered`. The surface is where the frames agree best on each texel's colour.
+    Arrays as for `gathered`. The surface is where the outlines say, and off the scalp where the frames agree best on each
+    texel's colour: a plane sweep (Collins, 1996), shells as planes. Where it is not skin, the shells above it fade where they
+    are seen edge on, as any does; those beneath fade little, for their edges are the head's outline.
     """
     shown = range(len(avatar.textures) - 2)
     sums = gathered(avatar, scene, frames, alpha, chosen, shown)[0]
@@ -130,7 +140,17 @@ def settle(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.nd
     known = np.isfinite(disagreement).any(0)[row, column] & (offsets[0][vertex] > STANDS_OFF_M)
     height = offsets[best[row, column], vertex]
     total, share = (np.bincount(vertex[known], weight, len(offsets[0])) for weight in (height[known], None))
-    avatar.place_shells(np.where(share > 0, total / np.maximum(share, 1), np.nan))
+    swept = np.where(share > 0, total / np.maximum(share, 1), np.nan)
+    surface = outlines.surface(avatar.head, outlines.touched(scene, alpha, chosen), swept)
+    avatar.place_shells(np.where(offsets[0] > STANDS_OFF_M, surface, np.nan))
+    with torch.no_grad():
+        avatar.fading[at_surface(len(avatar.textures)) :, torch.from_numpy(_covered(avatar, avatar.fading.shape[1]))] = STAYS
+
+
+def _covered(avatar: LayeredAvatar, side: int) -> np.ndarray:
+    """Texels [side, side] bool over which hair, or what else is not skin, is the surface."""
+    height = avatar.offsets_m.cpu().numpy()[at_surface(len(avatar.textures))]
+    return _map_of(avatar, height.astype(np.float32), "skin", side) > COVERED_M
 
 
 def project(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.ndarray, chosen: Sequence[int]) -> None:
@@ -143,6 +163,7 @@ def project(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.n
     # Where something stands off, the surface is the shell on whose colours the frames agree best; else the skin.
     nearest = _nearest(avatar, disagreement)
     nearest = np.where(stands_off & np.isfinite(disagreement).any(0), nearest, layers - 3)
+    nearest = np.where(_covered(avatar, side), np.clip(nearest, 1, at_surface(layers)), nearest)
     region = avatar.head.region.cpu().numpy()
     expressive = np.where(np.isin(region, [REGIONS.index(name) for name in EXPRESSIVE]), 1.0, OTHERS)
     for layer in range(layers):

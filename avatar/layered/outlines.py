@@ -46,6 +46,8 @@ def touched(scene: Scene, alpha: np.ndarray, frames: Sequence[int]) -> np.ndarra
     total, count = np.zeros((2, scene.head.vertex_count))
     for frame in frames:
         pixels = outline(alpha[frame])
+        if not len(pixels):
+            continue
         view, vertices = scene.view(frame, alpha.shape[1:]), scene.vertices_m[scene.place[frame]].numpy().astype(np.float64)
         drawn = raster.rasterise(view.pixels_of(vertices), triangles, alpha.shape[1:])[0] >= 0
         rays = view.through(*pixels.T)

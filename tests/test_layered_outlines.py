@@ -1,0 +1,105 @@
+"""Heights of hair from the mattes' outlines: against an ellipsoid that is larger than the mesh, and hard mattes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from toy_head import toy_head, toy_images, toy_track
+
+from avatar import build
+from avatar.config import TrainConfig
+from avatar.dataset import Scene
+from avatar.layered import initial, outlines
+from avatar.layered.model import LayeredAvatar
+from fitting.head_model import REGIONS, HeadModel
+from fitting.raster import vertex_normals
+
+SIZE, COUNT, HEIGHT_M = 128, 8, 0.009
+Made = tuple[HeadModel, Scene, np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def made() -> Made:
+    """A turning toy head, and pictures and mattes of one that is HEIGHT_M larger all around."""
+    head = toy_head(24, 36)
+    track = toy_track(head, COUNT, SIZE)
+    track["rotation"] = np.stack([np.linspace(-0.3, 0.3, COUNT), np.linspace(-0.35, 0.35, COUNT), np.zeros(COUNT)], 1).astype(
+        np.float32
+    )
+    track["expression"] *= 0
+    normals = vertex_normals(head.template.double().numpy(), head.triangles.numpy())
+    larger = replace(head, template=head.template + HEIGHT_M * torch.from_numpy(normals).float())
+    return head, Scene(head, track, range(COUNT)), *toy_images(larger, track, SIZE)
+
+
+def scalp(head: HeadModel) -> np.ndarray:
+    return (head.region == REGIONS.index("scalp")).numpy()
+
+
+def test_an_outline_goes_around_the_largest_part() -> None:
+    alpha = np.zeros((100, 120), np.uint8)
+    cv2.circle(alpha, (60, 50), 30, 255, -1)
+    alpha[5:9, 5:9], alpha[20, 100] = 255, 255
+    pixels = outlines.outline(alpha)
+    assert pixels.shape[1] == 2 and 100 < len(pixels) <= 2 * outlines.RAYS
+    np.testing.assert_allclose(np.linalg.norm(pixels - [60, 50], axis=1), 30, atol=1.5)
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_a_matte_without_an_outline_has_none(value: int) -> None:
+    assert outlines.outline(np.full((40, 50), value, np.uint8)).shape == (0, 2)
+
+
+def test_rays_that_touch_tell_how_far_the_surface_is(made: Made) -> None:
+    head, scene, _, alpha = made
+    found = outlines.touched(scene, alpha, range(COUNT))
+    known = np.isfinite(found)
+    assert found.shape == (head.vertex_count,) and 0.1 < known[scalp(head)].mean() < 1
+    assert abs(np.median(found[known]) - HEIGHT_M) < 0.002  # a pixel is 3 mm here
+    assert np.quantile(np.abs(found[known] - HEIGHT_M), 0.9) < 0.004
+
+
+def test_a_head_that_fills_its_matte_has_nothing_on_it(made: Made) -> None:
+    _, scene, _, alpha = made
+    nothing = outlines.touched(scene, np.zeros_like(alpha), range(COUNT))
+    assert np.isnan(nothing).all()
+    inside = np.stack([cv2.erode(one, np.ones((25, 25))) for one in alpha])  # rays that meet the mesh
+    found = outlines.touched(scene, inside, range(COUNT))
+    assert not found[np.isfinite(found)].any()
+
+
+def test_the_surface_is_drawn_on_between_outlines_and_keeps_to_the_sweep_on_the_face(made: Made) -> None:
+    head, scene, _, alpha = made
+    touched = outlines.touched(scene, alpha, range(COUNT))
+    found = outlines.surface(head, touched, np.where(scalp(head), 0.03, HEIGHT_M))
+    assert found.shape == (head.vertex_count,) and found.min() >= 0
+    assert abs(np.median(found[scalp(head)]) - HEIGHT_M) < 0.002  # and not the sweep's 30 mm
+    unseen = np.full(head.vertex_count, np.nan)
+    swept = outlines.surface(head, unseen, np.full(head.vertex_count, 0.02))
+    np.testing.assert_allclose(swept, 0.02, rtol=1e-3)  # with no outline at all the sweep decides
+    assert outlines.surface(head, unseen, unseen).max() < 1e-6
+
+
+def test_the_start_stands_where_the_outlines_say_and_its_rim_stays(made: Made) -> None:
+    head, scene, frames, alpha = made
+    torch.manual_seed(0)
+    keys = {"representation": "layers", "layers": 8, "bases": 2, "texture_size": 128, "uv_size": 64}
+    avatar: LayeredAvatar = build.build(build.settings_of(TrainConfig(**keys)), head)
+    avatar.shape_shell(torch.full((head.vertex_count,), 0.018))
+    for begin in (initial.settle, initial.project):
+        begin(avatar, scene, frames, alpha, range(COUNT))
+    middle = scalp(head) & (head.template[:, 1] < -0.08).numpy()
+    assert np.abs(avatar.offsets_m[initial.at_surface(8), middle].numpy() - HEIGHT_M).max() < 0.003
+    stays = avatar.fading.detach() == initial.STAYS
+    assert not stays[: initial.at_surface(8)].any() and stays[initial.at_surface(8) :].any((1, 2)).all()
+    view = scene.view(0, (SIZE, SIZE))
+    with torch.no_grad():
+        drawn = avatar.picture(avatar.pose(*scene.heads([0], "cpu")), view, torch.float32)[0].opacity.numpy().reshape(SIZE, SIZE)
+        avatar.fading[...] = 0
+        faded = avatar.picture(avatar.pose(*scene.heads([0], "cpu")), view, torch.float32)[0].opacity.numpy().reshape(SIZE, SIZE)
+    wrong = [np.abs(one - alpha[0] / 255)[:50].mean() for one in (drawn, faded)]  # the upper part: hair
+    assert wrong[0] < 0.75 * wrong[1]
