@@ -231,7 +231,8 @@ def eliminated(rows: Rows) -> Rows:
     if rows.nuisance is None or not len(rows.residual):
         return rows
     basis, triangle = np.linalg.qr(rows.nuisance)
-    size = np.abs(np.diag(triangle))
+    size = np.zeros(rows.nuisance.shape[1])  # of what is a column's own; there may be fewer rows than columns
+    size[: len(triangle)] = np.abs(np.diag(triangle))
     own = size > 1e-6 * np.maximum(1e-30, np.linalg.norm(triangle, axis=0))  # columns of any units, read from float32 pictures
     kept = (np.zeros(len(own)) if rows.kept is None else rows.kept)[own]
     if not own.all():  # those after a column that says nothing new must not be made orthogonal to its rounding errors

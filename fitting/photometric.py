@@ -167,6 +167,7 @@ def photometric_rows(
 
     What a motion of all samples together explains may count less than the rest: with a wrong identity or focal length the
     skin's colours sit a little wrong in every view, which should not turn the head; lids, brows and lips move against the rest.
+    The derivative leaves out how that motion's columns change with the pose; a step still counts only if the cost falls.
 
     Args:
         picture: one pyramid level; colour: [P] albedo times light, NaN where unknown; weight: [P]; sigma: grey values;

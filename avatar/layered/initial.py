@@ -14,7 +14,7 @@ import torch
 from scipy import ndimage
 
 from avatar.dataset import Scene
-from avatar.layered import outlines
+from avatar.layered import outlines, shells
 from avatar.layered.model import LayeredAvatar
 from fitting.head_model import REGIONS
 
@@ -105,11 +105,6 @@ def gathered(
     return sums, singles
 
 
-def at_surface(layers: int) -> int:
-    """Number of the shell just beneath the surface that `settle` finds, of so many layers; see `shells.around`."""
-    return max(layers - 5, 0)
-
-
 def _nearest(avatar: LayeredAvatar, disagreement: np.ndarray) -> np.ndarray:
     """The shell [side, side] on whose colours frames agree best; disagreement: [n, side, side], the skin's among them.
 
@@ -122,12 +117,12 @@ def _nearest(avatar: LayeredAvatar, disagreement: np.ndarray) -> np.ndarray:
     return ndimage.median_filter(best, MEDIAN)
 
 
-def settle(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.ndarray, chosen: Sequence[int]) -> None:
-    """Move the shells to the surface of what stands off the skin, in place.
+def settle(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.ndarray, chosen: Sequence[int]) -> np.ndarray:
+    """Move the shells to the surface of what stands off the skin, in place; returns the vertices [V] bool that it covers.
 
-    Arrays as for `gathered`. The surface is where the outlines say, and off the scalp where the frames agree best on each
-    texel's colour: a plane sweep (Collins, 1996), shells as planes. Where it is not skin, the shells above it fade where they
-    are seen edge on, as any does; those beneath fade little, for their edges are the head's outline.
+    Arrays as for `gathered`. The surface is where the outlines say, and off the scalp, where these are cut, where the frames
+    agree best on each texel's colour: a plane sweep (Collins, 1996), shells as planes. Where it is not skin, the shells above it
+    fade where they are seen edge on, as any does; those beneath fade little, for their edges are the head's outline.
     """
     shown = range(len(avatar.textures) - 2)
     sums = gathered(avatar, scene, frames, alpha, chosen, shown)[0]
@@ -142,19 +137,24 @@ def settle(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.nd
     total, share = (np.bincount(vertex[known], weight, len(offsets[0])) for weight in (height[known], None))
     swept = np.where(share > 0, total / np.maximum(share, 1), np.nan)
     surface = outlines.surface(avatar.head, outlines.touched(scene, alpha, chosen), swept)
-    avatar.place_shells(np.where(offsets[0] > STANDS_OFF_M, surface, np.nan))
+    known = offsets[0] > STANDS_OFF_M
+    avatar.place_shells(np.where(known, surface, np.nan))
+    covered = known & (np.nan_to_num(surface) > COVERED_M)
+    first, side = shells.at_surface(len(avatar.textures)), avatar.fading.shape[1]
     with torch.no_grad():
-        avatar.fading[at_surface(len(avatar.textures)) :, torch.from_numpy(_covered(avatar, avatar.fading.shape[1]))] = STAYS
+        avatar.fading[first:, torch.from_numpy(_map_of(avatar, covered.astype(np.float32), "skin", side) > 0.5)] = STAYS
+    return covered
 
 
-def _covered(avatar: LayeredAvatar, side: int) -> np.ndarray:
-    """Texels [side, side] bool over which hair, or what else is not skin, is the surface."""
-    height = avatar.offsets_m.cpu().numpy()[at_surface(len(avatar.textures))]
-    return _map_of(avatar, height.astype(np.float32), "skin", side) > COVERED_M
-
-
-def project(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.ndarray, chosen: Sequence[int]) -> None:
-    """Fill the textures from the chosen frames, in place. Arrays as for `gathered`."""
+def project(
+    avatar: LayeredAvatar,
+    scene: Scene,
+    frames: np.ndarray,
+    alpha: np.ndarray,
+    chosen: Sequence[int],
+    covered: np.ndarray | None = None,
+) -> None:
+    """Fill the textures from the chosen frames, in place. Arrays as for `gathered`; covered: [V] bool from `settle`."""
     layers, side = avatar.textures.shape[:2]
     sums, singles = gathered(avatar, scene, frames, alpha, chosen, range(layers))
     small = max(1, side // DETAIL)
@@ -163,7 +163,9 @@ def project(avatar: LayeredAvatar, scene: Scene, frames: np.ndarray, alpha: np.n
     # Where something stands off, the surface is the shell on whose colours the frames agree best; else the skin.
     nearest = _nearest(avatar, disagreement)
     nearest = np.where(stands_off & np.isfinite(disagreement).any(0), nearest, layers - 3)
-    nearest = np.where(_covered(avatar, side), np.clip(nearest, 1, at_surface(layers)), nearest)
+    if covered is not None and layers > 4:
+        there = _map_of(avatar, covered.astype(np.float32), "skin", side) > 0.5
+        nearest = np.where(there, np.clip(nearest, 1, shells.at_surface(layers)), nearest)
     region = avatar.head.region.cpu().numpy()
     expressive = np.where(np.isin(region, [REGIONS.index(name) for name in EXPRESSIVE]), 1.0, OTHERS)
     for layer in range(layers):

@@ -30,16 +30,17 @@ def outline(alpha: np.ndarray) -> np.ndarray:
     found = cv2.findContours(opaque, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
     if not found:
         return np.zeros((0, 2), np.int64)
-    pixels = max(found, key=len)[:, 0].astype(np.int64)
+    pixels = max(found, key=cv2.contourArea)[:, 0].astype(np.int64)
     height, width = alpha.shape
     inside = ((pixels >= BORDER_PX) & (pixels < [width - BORDER_PX, height - BORDER_PX])).all(1)
-    return pixels[inside][:: max(1, len(pixels) // RAYS)]
+    return pixels[inside][:: max(1, -(-len(pixels) // RAYS))]
 
 
 def touched(scene: Scene, alpha: np.ndarray, frames: Sequence[int]) -> np.ndarray:
-    """Mean distance [V] m at which the outlines' rays pass the vertices that lie nearest to them; NaN where none does.
+    """Mean distance [V] m at which the outlines' rays pass the scalp's vertices that lie nearest to them; NaN where none does.
 
-    alpha: [T, H, W] uint8; frames: those looked at. A ray that meets the mesh passes it at no distance.
+    alpha: [T, H, W] uint8; frames: those looked at. A ray that meets the mesh passes it at no distance. Rays that lie nearest to
+    other parts tell nothing: beside jaw and neck the mattes are cut (`fitting.trim`).
     """
     triangles = scene.head.triangles.cpu().numpy()
     skin = np.unique(triangles[~inner_triangles(scene.head)])
@@ -58,14 +59,17 @@ def touched(scene: Scene, alpha: np.ndarray, frames: Sequence[int]) -> np.ndarra
         distance = np.where(drawn[pixels[:, 1], pixels[:, 0]], 0.0, away[nearest, np.arange(len(pixels))])
         np.add.at(total, skin[nearest], distance)
         np.add.at(count, skin[nearest], 1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    scalp = scene.head.region.cpu().numpy() == REGIONS.index("scalp")
+    return np.where(scalp & (count > 0), total / np.maximum(count, 1), np.nan)
 
 
 def surface(head: HeadModel, touched_m: np.ndarray, swept_m: np.ndarray) -> np.ndarray:
     """Height [V] m of what is seen above the skin: smooth, close to the outlines' and, away from the scalp, to the sweep's.
 
-    touched_m: [V] from `touched`; swept_m: [V] of a plane sweep, NaN where it says nothing.
+    touched_m: [V] from `touched`; swept_m: [V] of a plane sweep, NaN where it says nothing. All NaN where both say nothing.
     """
+    if not (np.isfinite(touched_m) | np.isfinite(swept_m)).any():
+        return np.full(head.vertex_count, np.nan)
     scalp = head.region.cpu().numpy() == REGIONS.index("scalp")
     weight, right = np.full(head.vertex_count, 1e-6), np.zeros(head.vertex_count)
     for heights, share in ((touched_m, 1.0), (swept_m, np.where(scalp, SWEPT, 1.0))):

@@ -50,6 +50,17 @@ def averaging(head: HeadModel) -> sparse.csr_matrix:
     return sparse.diags(1 / np.asarray(beside.sum(1)).ravel()) @ beside
 
 
+def near(layers: int) -> np.ndarray:
+    """Heights m above a surface that is known, of the shells that lie around it: from the second to the one above the skin's."""
+    between = layers - 4
+    return np.linspace(*NEAR_M, between) if between > 1 else np.zeros(max(between, 0))
+
+
+def at_surface(layers: int) -> int:
+    """Number of the first shell that is not above a known surface; the skin's own where none lies around it."""
+    return 1 + int(np.argmax(near(layers) <= 0)) if layers > 4 else layers - 3
+
+
 def around(head: HeadModel, offsets_m: np.ndarray, surface_m: np.ndarray) -> np.ndarray:
     """Offsets [L, V] whose shells lie close around a surface [V] m above the skin, where it is known, NaN elsewhere.
 
@@ -59,7 +70,7 @@ def around(head: HeadModel, offsets_m: np.ndarray, surface_m: np.ndarray) -> np.
     placed = offsets_m.astype(np.float64)
     between = len(offsets_m) - 4  # shells from the second to the one above the skin's
     if between > 0 and known.any():
-        steps = np.linspace(NEAR_M[0], NEAR_M[1], between)[:, None]
+        steps = near(len(offsets_m))[:, None]
         skin = offsets_m[-3]
         placed[1:-3] = np.where(
             known, np.clip(surface_m + steps, skin + 1e-4, np.maximum(offsets_m[0], skin + 2e-4)), placed[1:-3]

@@ -83,8 +83,8 @@ class ImageLearner:
         self.avatar = build.build(build.settings_of(job.config), data.head)
         self.avatar.shape_shell(torch.from_numpy(measured_shell(data)))
         chosen = data.train[:: max(1, len(data.train) // PROJECTED)]
-        for begin in (initial.settle, initial.project):
-            begin(self.avatar, data.scene, data.frames, data.alpha, chosen)
+        seen = self.avatar, data.scene, data.frames, data.alpha, chosen
+        initial.project(*seen, initial.settle(*seen))
         self.optimiser = ImageOptimiser(self.avatar, len(data.scene.frames))
         self.perceptual = Perceptual(lpips.load(job.input.vgg, network="vgg16"), best_precision(self.device))
 
