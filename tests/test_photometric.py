@@ -159,6 +159,25 @@ def test_a_head_that_turns_as_a_whole_is_told_less_than_lids_that_move(made):
     assert told[0.0][1][10, 10] > 0  # an expression is told
 
 
+def test_with_part_of_the_rigid_motion_the_derivative_still_points_downhill(made):
+    """It leaves out how that motion's columns change with the pose: near a minimum its direction is right, its length nearly."""
+    rig, _, truth, *_ = made
+    random = np.random.default_rng(0)
+    y, x = np.mgrid[:240, :260] + 0.5
+    wave = 120 + 30 * np.sin(x * 2 * np.pi / 45) * np.cos(y * 2 * np.pi / 60)
+    level = Level(np.stack([wave, *np.gradient(wave)[::-1]], -1).astype(np.float32), np.zeros(2, int))
+    surface, pose = photometric.choose_samples(rig, 300).surface, truth.pose(1)
+    value = photometric.read(level, camera.project(posed(surface, pose).points, LENS.focal_px, LENS.centre_px))[0][:, 0]
+    colour, weight = value + random.normal(0, 2, 300), random.uniform(0.1, 1, 300)
+    rows = partial(photometric.photometric_rows, level, colour, weight, 3.0, 0.1, LENS, 1e9, rigid=0.3)
+    problem, moved = problem_of(rows, surface), pose.moved(random.normal(0, 0.001, D))
+    found, expected = problem.gradient(moved, problem.evaluate(moved)[1]), differences(lambda p: problem.evaluate(p)[0], moved)
+    scale = np.sqrt(np.diag(problem.normal(moved, problem.evaluate(moved)[1])[0]))  # rad, m and codes are not comparable
+    found, expected = found / scale, expected / scale
+    assert found @ expected > 0.95 * np.linalg.norm(found) * np.linalg.norm(expected)
+    assert 0.8 < np.linalg.norm(found) / np.linalg.norm(expected) < 1.25
+
+
 def test_exposure_changes_nothing(made):
     """Gain and offset of a frame, or of the albedo: same rows, same minimum."""
     rig, _, truth, *_ = made
