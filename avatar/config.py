@@ -31,6 +31,11 @@ class TrainConfig(StepConfig):
         "shell", description="One network in a shell around the mesh, or the paper's coarse and fine ones on the whole ray."
     )
     steps: int = Field(2000, ge=1, description="Optimisation steps; the points of the paper's schedule scale with it.")
+    budget: Literal["auto"] | float | None = Field(
+        None,
+        description="Minutes in which steps, samples, maps and extras are chosen by measured trials and the avatar is trained; "
+        "`auto`: until held-out frames no longer get better, 30 at most. null: the keys are as they stand.",
+    )
     seed: int = Field(0, description="Seed of every random number in training.")
     rays: int = Field(1024, ge=1, le=65536, description="Rays a step, over all its frames.")
     frames_per_step: int = Field(2, ge=1, le=64, description="Frames from which a step draws its rays.")
@@ -65,6 +70,13 @@ class TrainConfig(StepConfig):
     layers: int = Field(8, ge=3, le=16, description="Layers: surfaces, the inner parts' included.")
     bases: int = Field(3, ge=0, le=8, description="Layers: textures that the network mixes into the static one.")
     texture_size: int = Field(512, ge=64, le=2048, description="Layers: texels a side of each surface's texture.")
+
+    @field_validator("budget")
+    @classmethod
+    def _minutes(cls, budget: str | float | None) -> str | float | None:
+        if isinstance(budget, float) and not 0 < budget <= 10000:
+            raise ValueError("give minutes, above 0 and at most 10000, or auto")
+        return budget
 
 
 class RenderConfig(StepConfig):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import time
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from avatar import build, checkpoint, coverage, learning
+from avatar.budget import decide, questions
 from avatar.checkpoint import BAD_WINDOW, State
 from avatar.config import TrainConfig, modules_of
 from avatar.dataset import Scene
@@ -108,7 +110,7 @@ def loop(job: step.Job, learner: Learner, data: Data, state: State, path: Path, 
     """Train to the last step, with a checkpoint every minute and when interrupted."""
     config = job.config
     started, before = time.perf_counter(), state.seconds
-    saved, every = started, max(1, config.steps // PROBES)
+    saved, every = started, max(1, config.steps // (PROBES if config.budget is None else 2 * PROBES))
     with checkpoint.deferred_interrupts() as interrupted:
         for _ in job.progress(range(state.step, config.steps), "training"):
             state.losses.append(optimise(learner, state))
@@ -118,6 +120,9 @@ def loop(job: step.Job, learner: Learner, data: Data, state: State, path: Path, 
                 state.curve.append([state.step, state.seconds, float(np.mean(state.losses)), quality])
                 job.log.info("step %d: loss %.4f, probe %.2f dB, %.0f s", *(state.curve[-1][i] for i in (0, 2, 3, 1)))
                 state.losses = []
+                if config.budget == "auto" and questions.plateau(state.curve, config.steps):
+                    job.log.info("training ends at step %d: no longer better on the held-out frames", state.step)
+                    break
             if interrupted or time.perf_counter() - saved > CHECKPOINT_S:
                 checkpoint.save(path, mark, state, learner.avatar, learner.optimiser)
                 saved = time.perf_counter()
@@ -126,14 +131,29 @@ def loop(job: step.Job, learner: Learner, data: Data, state: State, path: Path, 
     checkpoint.save(path, mark, state, learner.avatar, learner.optimiser)
 
 
+def begin(job: step.Job, data: Data, path: Path, mark: str) -> tuple[step.Job, Learner, State, dict | None]:
+    """The job with the config that is trained, its learner where it goes on from, and what `train.budget` decided."""
+    # By name: code that trains one kind of avatar is no part of the digest of the others.
+    module = import_module(modules_of(job.config.representation, training=True)[-1])
+    known = decide.remembered(path.parent, mark) if path.exists() else None
+    if job.config.budget is not None and known is None:
+        make = lambda config: module.learner(replace(job, config=config), data)  # noqa: E731
+        run, decided = decide.decide(job, data, make, optimise)
+        decide.remember(path.parent, mark, run.config, decided)
+        checkpoint.save(path, mark, run.state, run.learner.avatar, run.learner.optimiser)
+        return replace(job, config=run.config), run.learner, run.state, decided
+    config, decided = known or (job.config, None)
+    job = replace(job, config=config)
+    learner = module.learner(job, data)
+    return job, learner, checkpoint.resume(job, path, mark, learner.avatar, learner.optimiser), decided
+
+
 def run(job: step.Job) -> None:
     """Inputs head frames alpha track split; outputs avatar curve report."""
     data = load(job)
     found = preflight(job, data)
-    # By name: code that trains one kind of avatar is no part of the digest of the others.
-    learner = import_module(modules_of(job.config.representation, training=True)[-1]).learner(job, data)
     path, mark = job.final.avatar.parent / "checkpoints" / "last.pt", checkpoint.fingerprint(job)
-    state = checkpoint.resume(job, path, mark, learner.avatar, learner.optimiser)
+    job, learner, state, decided = begin(job, data, path, mark)
     loop(job, learner, data, state, path, mark)
     checkpoint.write(job.output.avatar, build.content(learner.avatar, build.settings_of(job.config), data.head))
     lines = ["step\tseconds\tloss\tprobe_psnr", *("\t".join(f"{value:.6g}" for value in row) for row in state.curve)]
@@ -142,6 +162,7 @@ def run(job: step.Job) -> None:
         job.output.report,
         {
             "steps": state.step,
+            **({} if decided is None else {"budget": decided}),
             "train_seconds": round(state.seconds, 2),
             "skipped_steps": state.skipped,
             "preflight_overlap": round(found, 3),

@@ -77,7 +77,7 @@ def test_config_of_a_run(pipeline: Pipeline, argument: str, expected: str) -> No
         ("variants: {demo: {prset: fast}}", "variants.demo.prset is not a key; did you mean variants.demo.preset?"),
         (
             "variants: {demo: {preset: quick}}",
-            "config/presets: there is no preset 'quick'; the presets are demo, fast, layers, paper",
+            "config/presets: there is no preset 'quick'; the presets are balanced, demo, fast, layers, paper",
         ),
         ("variants: {fit: {preset: demo}}", "variants.fit: this name is taken"),
         ("variants: {export: {preset: demo}}", "variants.export: this name is taken"),

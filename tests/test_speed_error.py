@@ -72,6 +72,15 @@ def test_everything_that_can_be_chosen_is_compared() -> None:
         assert name.split("_")[0] in ("frames", "pixels", "vertices")
 
 
+def test_presets_that_are_one_training_when_cut_are_trained_once() -> None:
+    short, long = (PRESETS["demo"].model_copy(update={"steps": steps}) for steps in (settings.PRESET_STEPS + 1, 9999))
+    presets = {"long": long, "short": short, "other": PRESETS["demo"].model_copy(update={"steps": 3})}
+    assert [settings.stands_for(presets, name) for name in presets] == ["long", "long", "other"]
+    made = [name for name in settings.trainings(presets | {"demo": PRESETS["demo"]}) if name.startswith("preset_")]
+    assert made == ["preset_long", "preset_other", "preset_demo"]
+    assert settings.left_out(presets) == {"preset short": "cut to 1,200 steps it is the same training as preset long"}
+
+
 def test_rows_that_stand_for_the_default_are_the_default() -> None:
     assert settings.DEFAULT_END == marching.END
     base = settings.base_of(PRESETS)

@@ -157,6 +157,12 @@ def write_player(
     return {"file": "player.mp4", "data": content, "order": order, "comment": " ".join(comments)}
 
 
+def decisions_of(training: dict[str, Any]) -> list[tuple[str, str]]:
+    """What `train.budget` decided: the decision, and what was taken with its reason."""
+    rows = training.get("budget", {}).get("decisions", [])
+    return [(row["decision"], f"{row['taken']}: {row['reason']}") for row in rows]
+
+
 def content(job: step.Job, folder: Folder) -> dict[str, Any]:
     """Everything that the template shows; pictures and videos are written on the way."""
     documents = _documents(job)
@@ -179,7 +185,10 @@ def content(job: step.Job, folder: Folder) -> dict[str, Any]:
             "plots": [{"file": folder.copy(path, path.name), "alt": f"{path.stem} plot"} for path in many(job.input, "plots")],
             "trims": trim_previews(job, folder, time_s),
             "stages": stages_of(documents),
-            "trainings": [{"variant": name, "facts": facts(item)} for name, item in stages["train"].items()],
+            "trainings": [
+                {"variant": name, "facts": facts(item, ("budget",)), "decisions": decisions_of(item)}
+                for name, item in stages["train"].items()
+            ],
         }
         | _scored(stages["evaluate"], len(time_s))
         | _fitted(documents)

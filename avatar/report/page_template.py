@@ -88,7 +88,9 @@ BODY = (
 <td class="wide"><span class="bar" style="width:{{ item.percent }}%"></span></td></tr>
 {% endfor %}</tbody></table></div>
 <p class="soft after">{{ machine }}</p>
-{% for item in trainings %}<details><summary>Training of {{ item.variant }}</summary>
+{% for item in trainings %}{% if item.decisions %}<h3>What the budget of {{ item.variant }} decided, and why</h3>
+<dl>{% for name, value in item.decisions %}<dt>{{ name }}</dt><dd>{{ value }}</dd>{% endfor %}</dl>
+{% endif %}<details><summary>Training of {{ item.variant }}</summary>
 <dl>{% for name, value in item.facts %}<dt>{{ name }}</dt><dd>{{ value }}</dd>{% endfor %}</dl></details>
 {% endfor %}</section>
 <section id="reproduce">

@@ -91,21 +91,32 @@ def trainings(presets: Mapping[str, TrainConfig]) -> dict[str, Training]:
     keys = {"sampling": "hierarchical", "coarse_samples": half, "fine_samples": half}
     found["dense_trained"] = changed("trained on whole rays, coarse and fine", **keys, steps=DENSE_STEPS)
     for name, config in presets.items():
-        if config.sampling != "hierarchical":
+        if stands_for(presets, name) == name:
             steps = min(config.steps, PRESET_STEPS)
             of = config.steps if steps < config.steps else None
             found[f"preset_{name}"] = Training(config.model_copy(update={"steps": steps}), f"preset {name}", of)
     return found
 
 
+def stands_for(presets: Mapping[str, TrainConfig], name: str) -> str | None:
+    """The preset whose row shows this one: the longest of those that are one training when cut; None where none fits the hour."""
+    if presets[name].sampling == "hierarchical":
+        return None
+    cut = {other: config.model_copy(update={"steps": min(config.steps, PRESET_STEPS)}) for other, config in presets.items()}
+    return max((other for other in presets if cut[other] == cut[name]), key=lambda other: presets[other].steps)
+
+
 def left_out(presets: Mapping[str, TrainConfig]) -> dict[str, str]:
     """What does not fit the hour, with the reason."""
     why = "{steps:,} steps of {samples} evaluations a ray on whole rays: a step took 40 to 80 s and 11 GB on one core"
-    return {
-        f"preset {name}": why.format(steps=config.steps, samples=2 * config.coarse_samples + config.fine_samples)
-        for name, config in presets.items()
-        if config.sampling == "hierarchical"
-    }
+    found = {}
+    for name, config in presets.items():
+        if (other := stands_for(presets, name)) is None:
+            samples = 2 * config.coarse_samples + config.fine_samples
+            found[f"preset {name}"] = why.format(steps=config.steps, samples=samples)
+        elif other != name:
+            found[f"preset {name}"] = f"cut to {PRESET_STEPS:,} steps it is the same training as preset {other}"
+    return found
 
 
 def renderings(presets: Mapping[str, TrainConfig]) -> dict[str, Rendering]:
