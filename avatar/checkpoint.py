@@ -35,6 +35,9 @@ class State:
     curve: list[list[float]] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)  # since the curve's last row
     recent: deque[bool] = field(default_factory=lambda: deque(maxlen=BAD_WINDOW))
+    planned: int = 0  # steps that `avatar.budget` planned; 0 before it did
+    decisions: list[dict] = field(default_factory=list)  # and with what reasons
+    ended: bool = False  # before all steps: a plateau
 
 
 @contextmanager

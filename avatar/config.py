@@ -33,8 +33,8 @@ class TrainConfig(StepConfig):
     steps: int = Field(2000, ge=1, description="Optimisation steps; the points of the paper's schedule scale with it.")
     budget: Literal["auto"] | float | None = Field(
         None,
-        description="Minutes in which steps, samples, maps and extras are chosen by measured trials and the avatar is trained; "
-        "`auto`: until held-out frames no longer get better, 30 at most. null: the keys are as they stand.",
+        description="Minutes of training in the place of `steps`, above 0 and at most 10000; `auto`: until held-out frames no "
+        "longer get better, 30 at most. null: as many steps as `steps` says.",
     )
     seed: int = Field(0, description="Seed of every random number in training.")
     rays: int = Field(1024, ge=1, le=65536, description="Rays a step, over all its frames.")
@@ -71,10 +71,11 @@ class TrainConfig(StepConfig):
     bases: int = Field(3, ge=0, le=8, description="Layers: textures that the network mixes into the static one.")
     texture_size: int = Field(512, ge=64, le=2048, description="Layers: texels a side of each surface's texture.")
 
-    @field_validator("budget")
+    @field_validator("budget", mode="before")
     @classmethod
-    def _minutes(cls, budget: str | float | None) -> str | float | None:
-        if isinstance(budget, float) and not 0 < budget <= 10000:
+    def _minutes(cls, budget: object) -> object:
+        number = isinstance(budget, (int, float)) and not isinstance(budget, bool)
+        if budget not in (None, "auto") and not (number and 0 < budget <= 10000):
             raise ValueError("give minutes, above 0 and at most 10000, or auto")
         return budget
 

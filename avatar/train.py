@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import time
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -12,8 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avatar import build, checkpoint, coverage, learning
-from avatar.budget import decide, questions
+from avatar import budget, build, checkpoint, coverage, learning
 from avatar.checkpoint import BAD_WINDOW, State
 from avatar.config import TrainConfig, modules_of
 from avatar.dataset import Scene
@@ -106,13 +104,15 @@ def optimise(learner: Learner, state: State) -> float:
     return float(loss.value.detach())
 
 
-def loop(job: step.Job, learner: Learner, data: Data, state: State, path: Path, mark: str) -> None:
-    """Train to the last step, with a checkpoint every minute and when interrupted."""
+def loop(job: step.Job, learner: Learner, data: Data, state: State, path: Path, mark: str, until: int) -> None:
+    """Train to step `until` of the config's, with a checkpoint every minute and when interrupted."""
     config = job.config
     started, before = time.perf_counter(), state.seconds
-    saved, every = started, max(1, config.steps // (PROBES if config.budget is None else 2 * PROBES))
+    saved, every = started, max(1, config.steps // (PROBES if config.budget is None else budget.PROBES))
     with checkpoint.deferred_interrupts() as interrupted:
-        for _ in job.progress(range(state.step, config.steps), "training"):
+        for _ in job.progress(range(state.step, until), "training"):
+            if budget.ends(job, state):
+                break
             state.losses.append(optimise(learner, state))
             state.seconds = before + time.perf_counter() - started
             if state.step % every == 0 or state.step == config.steps:
@@ -120,9 +120,6 @@ def loop(job: step.Job, learner: Learner, data: Data, state: State, path: Path, 
                 state.curve.append([state.step, state.seconds, float(np.mean(state.losses)), quality])
                 job.log.info("step %d: loss %.4f, probe %.2f dB, %.0f s", *(state.curve[-1][i] for i in (0, 2, 3, 1)))
                 state.losses = []
-                if config.budget == "auto" and questions.plateau(state.curve, config.steps):
-                    job.log.info("training ends at step %d: no longer better on the held-out frames", state.step)
-                    break
             if interrupted or time.perf_counter() - saved > CHECKPOINT_S:
                 checkpoint.save(path, mark, state, learner.avatar, learner.optimiser)
                 saved = time.perf_counter()
@@ -131,30 +128,19 @@ def loop(job: step.Job, learner: Learner, data: Data, state: State, path: Path, 
     checkpoint.save(path, mark, state, learner.avatar, learner.optimiser)
 
 
-def begin(job: step.Job, data: Data, path: Path, mark: str) -> tuple[step.Job, Learner, State, dict | None]:
-    """The job with the config that is trained, its learner where it goes on from, and what `train.budget` decided."""
-    # By name: code that trains one kind of avatar is no part of the digest of the others.
-    module = import_module(modules_of(job.config.representation, training=True)[-1])
-    known = decide.remembered(path.parent, mark) if path.exists() else None
-    if job.config.budget is not None and known is None:
-        make = lambda config: module.learner(replace(job, config=config), data)  # noqa: E731
-        run, decided = decide.decide(job, data, make, optimise)
-        decide.remember(path.parent, mark, run.config, decided)
-        checkpoint.save(path, mark, run.state, run.learner.avatar, run.learner.optimiser)
-        return replace(job, config=run.config), run.learner, run.state, decided
-    config, decided = known or (job.config, None)
-    job = replace(job, config=config)
-    learner = module.learner(job, data)
-    return job, learner, checkpoint.resume(job, path, mark, learner.avatar, learner.optimiser), decided
-
-
 def run(job: step.Job) -> None:
     """Inputs head frames alpha track split; outputs avatar curve report."""
     data = load(job)
     found = preflight(job, data)
+    # By name: code that trains one kind of avatar is no part of the digest of the others.
+    learner = import_module(modules_of(job.config.representation, training=True)[-1]).learner(job, data)
     path, mark = job.final.avatar.parent / "checkpoints" / "last.pt", checkpoint.fingerprint(job)
-    job, learner, state, decided = begin(job, data, path, mark)
-    loop(job, learner, data, state, path, mark)
+    state = checkpoint.resume(job, path, mark, learner.avatar, learner.optimiser)
+    plans = [(job, job.config.steps)]
+    if job.config.budget is not None:
+        plans = budget.schedules(job, learner, data, state, optimise)
+    for planned, until in plans:
+        loop(planned, learner, data, state, path, mark, until)
     checkpoint.write(job.output.avatar, build.content(learner.avatar, build.settings_of(job.config), data.head))
     lines = ["step\tseconds\tloss\tprobe_psnr", *("\t".join(f"{value:.6g}" for value in row) for row in state.curve)]
     job.output.curve.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -162,7 +148,7 @@ def run(job: step.Job) -> None:
         job.output.report,
         {
             "steps": state.step,
-            **({} if decided is None else {"budget": decided}),
+            **({"budget": {"decisions": state.decisions}} if state.decisions else {}),
             "train_seconds": round(state.seconds, 2),
             "skipped_steps": state.skipped,
             "preflight_overlap": round(found, 3),

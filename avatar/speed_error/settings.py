@@ -94,7 +94,8 @@ def trainings(presets: Mapping[str, TrainConfig]) -> dict[str, Training]:
         if stands_for(presets, name) == name:
             steps = min(config.steps, PRESET_STEPS)
             of = config.steps if steps < config.steps else None
-            found[f"preset_{name}"] = Training(config.model_copy(update={"steps": steps}), f"preset {name}", of)
+            kept = {"steps": steps, "budget": None}
+            found[f"preset_{name}"] = Training(config.model_copy(update=kept), f"preset {name}", of)
     return found
 
 
@@ -141,11 +142,15 @@ def renderings(presets: Mapping[str, TrainConfig]) -> dict[str, Rendering]:
     found |= {f"kind_{name}": Rendering("representation", name, name) for name in choices("representation")}
     small, few = ({"size": SMALL_PX, "frames": count} for count in (SMALL_FRAMES, FEW_FRAMES))
     coarse, fine = PAPER_SAMPLES
-    found["dense_64_128px"] = Rendering("small", f"{DENSE_SAMPLES} uniform, {SMALL_FRAMES} frames", keys=small | dense)
-    found["shell_128px"] = Rendering("small", f"shell, {SMALL_FRAMES} frames", keys=small)
+    # Of the longest training there is: whole rays and the shell agree only where the density has become clear.
+    fields = [name for name in made if name.startswith("preset_") and made[name].config.representation == base.representation]
+    of = max(fields, key=lambda name: made[name].config.steps, default=BASE)
+    found["dense_64_128px"] = Rendering("small", f"{DENSE_SAMPLES} uniform, {SMALL_FRAMES} frames", of, small | dense)
+    found["shell_128px"] = Rendering("small", f"shell, {SMALL_FRAMES} frames", of, small)
     keys = few | {"sampling": "dense_fine", "samples": coarse, "fine_samples": fine}
-    found["paper_128px"] = Rendering("small", f"{coarse} uniform + {fine} fine, {FEW_FRAMES} frames", keys=keys)
-    found["shell_128px_few"] = Rendering("small", f"shell, {FEW_FRAMES} frames", keys=few)
+    found["shell_128px_20"] = Rendering("small", f"shell, 20 samples, {SMALL_FRAMES} frames", of, small | {"samples": 20})
+    found["paper_128px"] = Rendering("small", f"{coarse} uniform + {fine} fine, {FEW_FRAMES} frames", of, keys)
+    found["shell_128px_few"] = Rendering("small", f"shell, {FEW_FRAMES} frames", of, few)
     return found
 
 

@@ -1,1 +1,0 @@
-"""`train.budget`: what to train, and for how long, decided by short measured trials; every decision has its reason."""
