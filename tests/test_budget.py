@@ -16,6 +16,7 @@ from avatar import budget, train
 from avatar.checkpoint import State
 from avatar.config import TrainConfig
 from avatar.learning import rays
+from avatar.report import page
 
 CONFIG = TrainConfig(**SMALL | {"steps": 40, "budget": 1.0, "representation": "static", "rays": 64})
 
@@ -136,6 +137,12 @@ def test_training_within_a_budget_goes_on_after_a_kill(
     report = json.loads(outputs(tmp_path)["report"].read_text())
     rows = {row["decision"]: row["taken"] for row in report["budget"]["decisions"]}
     assert rows["steps"] == 16 + 30 and report["steps"] == rows["steps again"] == round(budget.LATE[1] * 46) + 30
+
+
+def test_the_page_tells_what_was_decided() -> None:
+    rows = [budget.answered("steps", 1900, "0.250 s each", step_s=0.25), budget.answered("end", 1500, "no longer better")]
+    told = [("steps", "1900: 0.250 s each"), ("end", "1500: no longer better")]
+    assert page.decisions_of({"budget": {"decisions": rows}}) == told and page.decisions_of({"steps": 3}) == []
 
 
 def test_without_a_budget_nothing_is_decided(inputs: dict[str, Path], tmp_path: Path) -> None:
