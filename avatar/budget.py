@@ -110,10 +110,11 @@ def _first(
     )
     if job.config.budget == "auto":
         reason += f"; fewer where the held-out frames gain less than {PLATEAU_DB:g} dB"
-    height = f"the head is {head_height_px(data):.0f} px high; a ray costs the same at any resolution"
-    state.decisions = [answered("resolution", "all pixels", height)]
-    if job.config.sampling == "shell" and job.config.representation != "layers":
-        state.decisions.append(shell_found(data))
+    state.decisions = []
+    if job.config.representation != "layers":
+        height = f"the head is {head_height_px(data):.0f} px high; a ray costs the same at any resolution"
+        state.decisions = [answered("resolution", "all pixels", height)]
+        state.decisions += [shell_found(data)] if job.config.sampling == "shell" else []
     state.decisions.append(answered("steps", state.planned, reason, step_s=round(step_s, 4)))
     job.log.info("budget: %d steps of %.3f s", state.planned, step_s)
 
