@@ -74,10 +74,15 @@ class TrainConfig(StepConfig):
     @field_validator("budget", mode="before")
     @classmethod
     def _minutes(cls, budget: object) -> object:
-        number = isinstance(budget, (int, float)) and not isinstance(budget, bool)
-        if budget not in (None, "auto") and not (number and 0 < budget <= 10000):
+        if budget in (None, "auto"):
+            return budget
+        try:  # a command line gives text
+            minutes = float("nan") if isinstance(budget, bool) else float(budget)
+        except (TypeError, ValueError):
+            minutes = float("nan")
+        if not 0 < minutes <= 10000:
             raise ValueError("give minutes, above 0 and at most 10000, or auto")
-        return budget
+        return minutes
 
 
 class RenderConfig(StepConfig):

@@ -35,9 +35,13 @@ def outputs(folder: Path) -> dict[str, Path]:
     return {"avatar": folder / "avatar.pt", "curve": folder / "curve.tsv", "report": folder / "train.json"}
 
 
-@pytest.mark.parametrize("wrong", [0, -1.0, 20000, "much", True, float("nan"), float("inf")])
+@pytest.mark.parametrize("wrong", [0, -1.0, 20000, "much", "0", [8], True, float("nan"), float("inf")])
 def test_a_budget_is_minutes_or_auto(wrong: object) -> None:
-    assert TrainConfig(budget="auto").budget == "auto" and TrainConfig(budget=8).budget == 8.0 and TrainConfig().budget is None
+    assert (
+        TrainConfig(budget="auto").budget == "auto"
+        and TrainConfig(budget=8).budget == TrainConfig(budget="8").budget == 8.0
+        and TrainConfig().budget is None
+    )
     assert budget.minutes_of("auto") == budget.AUTO_MINUTES and budget.minutes_of(8) == 8.0
     with pytest.raises(ValueError, match="give minutes, above 0"):
         TrainConfig(budget=wrong)
