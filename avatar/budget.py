@@ -18,7 +18,6 @@ import numpy as np
 
 from avatar import coverage, learning, shell
 from avatar.checkpoint import State
-from avatar.config import TrainConfig
 from avatar.dataset import shrink_any
 from avatar.learning import Data, Learner, measured_shell
 from workflow import step
@@ -36,7 +35,6 @@ LATE = (0.3, 0.4)
 PLATEAU_DB, PLATEAU_SHARE, PLATEAU_FROM = 0.05, 0.25, 0.5
 """`auto` ends when the mean probe of the last 25 % of the steps is not this much above that of the 25 % before; never before half
 of the steps that fit. By means: single probes go up and down by 0.3 dB. Minutes that are named are used to their end."""
-LOOKED_AT = 12
 
 
 def minutes_of(budget: float | str) -> float:
@@ -75,15 +73,15 @@ def schedules(
     minutes = minutes_of(job.config.budget)
     if not state.planned:
         _first(job, learner, data, state, optimise, 60 * minutes)
-    first = state.planned
     if not any(row["decision"] == "steps again" for row in state.decisions):
-        for share in LATE:
-            before = state.step, state.seconds
-            yield _told(job, learner, first), min(first, round(share * first))
-        if state.step > before[0]:
-            step_s = (state.seconds - before[1]) / (state.step - before[0])
+        first = state.planned
+        yield _told(job, learner, first), round(LATE[1] * first)
+        rows = [row for row in state.curve if row[0] >= LATE[0] * first]
+        if len(rows) > 1:
+            count = rows[-1][0] - rows[0][0]
+            step_s = (rows[-1][1] - rows[0][1]) / count
             state.planned = state.step + steps_in(60 * minutes - state.seconds, step_s)
-            reason = f"the last {state.step - before[0]} steps took {step_s:.3f} s each, looking at the held-out frames included"
+            reason = f"the last {count} steps took {step_s:.3f} s each, looking at the held-out frames included"
             state.decisions.append(answered("steps again", state.planned, reason, step_s=round(step_s, 4)))
             job.log.info("budget: %d steps", state.planned)
     yield _told(job, learner, state.planned), state.planned
@@ -95,7 +93,7 @@ def _first(
     """Time the first steps, and plan with them; in place."""
     started, taken = time.perf_counter(), []
     _told(job, learner, GUESSED_STEPS)
-    while len(taken) < UNTIMED_STEPS + TIMED_STEPS and time.perf_counter() - started < TIMED_SHARE * seconds:
+    while not taken or (len(taken) < UNTIMED_STEPS + TIMED_STEPS and time.perf_counter() - started < TIMED_SHARE * seconds):
         begun = time.perf_counter()
         state.losses.append(optimise(learner, state))
         taken.append(time.perf_counter() - begun)
@@ -110,11 +108,8 @@ def _first(
     )
     if job.config.budget == "auto":
         reason += f"; fewer where the held-out frames gain less than {PLATEAU_DB:g} dB"
-    state.decisions = []
-    if job.config.representation != "layers":
-        height = f"the head is {head_height_px(data):.0f} px high; a ray costs the same at any resolution"
-        state.decisions = [answered("resolution", "all pixels", height)]
-        state.decisions += [shell_found(data)] if job.config.sampling == "shell" else []
+    if job.config.sampling == "shell" and job.config.representation != "layers":
+        state.decisions.append(shell_found(data))
     state.decisions.append(answered("steps", state.planned, reason, step_s=round(step_s, 4)))
     job.log.info("budget: %d steps of %.3f s", state.planned, step_s)
 
@@ -136,18 +131,9 @@ def answered(decision: str, taken: Any, reason: str, **more: Any) -> dict[str, A
 
 def _told(job: step.Job, learner: Learner, steps: int) -> step.Job:
     """The job with a schedule of `steps`, of which the learner is told too."""
-    config: TrainConfig = job.config.model_copy(update={"steps": steps})
+    config = job.config.model_copy(update={"steps": steps})
     learner.config = config
     return replace(job, config=config)
-
-
-def head_height_px(data: Data) -> float:
-    """Median height of the matte over some training frames, pixels."""
-    heights = []
-    for frame in data.train[:: max(1, len(data.train) // LOOKED_AT)]:
-        rows = np.flatnonzero((np.asarray(data.alpha[frame]) > 127).any(1))
-        heights.append(rows[-1] + 1 - rows[0] if len(rows) else 0)
-    return float(np.median(heights))
 
 
 def shell_found(data: Data) -> dict[str, Any]:

@@ -15,7 +15,7 @@ BASE = "ours_d"
 STEPS, PRESET_STEPS, DENSE_STEPS = 400, 1200, 100
 """Of a training; at most of a preset's own; of the training on whole rays, whose step takes several times as long."""
 SIZE_PX, FRAMES = 256, 6
-SMALL_PX, SMALL_FRAMES, FEW_FRAMES = 128, 8, 2
+SMALL_PX, SMALL_FRAMES, FEW_FRAMES, SMALL_SAMPLES = 128, 8, 2, 20
 SAMPLES, ENDS, UV_SIZES = (4, 8, 12, 16, 24, 32), (0.0, 0.001, 0.004, 0.02, 0.1), (64, 128, 256)
 DEFAULT_SAMPLES, DEFAULT_END = 24, 0.004
 """What `render` takes of preset `demo`, and `avatar.marching.END`: rows with these are one rendering, timed once."""
@@ -92,19 +92,23 @@ def trainings(presets: Mapping[str, TrainConfig]) -> dict[str, Training]:
     found["dense_trained"] = changed("trained on whole rays, coarse and fine", **keys, steps=DENSE_STEPS)
     for name, config in presets.items():
         if stands_for(presets, name) == name:
-            steps = min(config.steps, PRESET_STEPS)
-            of = config.steps if steps < config.steps else None
-            kept = {"steps": steps, "budget": None}
-            found[f"preset_{name}"] = Training(config.model_copy(update=kept), f"preset {name}", of)
+            short = cut(config)
+            of = config.steps if short.steps < config.steps else None
+            found[f"preset_{name}"] = Training(short, f"preset {name}", of)
     return found
+
+
+def cut(config: TrainConfig) -> TrainConfig:
+    """A preset's training with PRESET_STEPS steps at most."""
+    return config.model_copy(update={"steps": min(config.steps, PRESET_STEPS), "budget": None})
 
 
 def stands_for(presets: Mapping[str, TrainConfig], name: str) -> str | None:
     """The preset whose row shows this one: the longest of those that are one training when cut; None where none fits the hour."""
     if presets[name].sampling == "hierarchical":
         return None
-    cut = {other: config.model_copy(update={"steps": min(config.steps, PRESET_STEPS)}) for other, config in presets.items()}
-    return max((other for other in presets if cut[other] == cut[name]), key=lambda other: presets[other].steps)
+    alike = (other for other, config in presets.items() if cut(config) == cut(presets[name]))
+    return max(alike, key=lambda other: presets[other].steps)
 
 
 def left_out(presets: Mapping[str, TrainConfig]) -> dict[str, str]:
@@ -147,8 +151,9 @@ def renderings(presets: Mapping[str, TrainConfig]) -> dict[str, Rendering]:
     of = max(fields, key=lambda name: made[name].config.steps, default=BASE)
     found["dense_64_128px"] = Rendering("small", f"{DENSE_SAMPLES} uniform, {SMALL_FRAMES} frames", of, small | dense)
     found["shell_128px"] = Rendering("small", f"shell, {SMALL_FRAMES} frames", of, small)
+    what = f"shell, {SMALL_SAMPLES} samples, {SMALL_FRAMES} frames"
+    found["shell_128px_fewer"] = Rendering("small", what, of, small | {"samples": SMALL_SAMPLES})
     keys = few | {"sampling": "dense_fine", "samples": coarse, "fine_samples": fine}
-    found["shell_128px_20"] = Rendering("small", f"shell, 20 samples, {SMALL_FRAMES} frames", of, small | {"samples": 20})
     found["paper_128px"] = Rendering("small", f"{coarse} uniform + {fine} fine, {FEW_FRAMES} frames", of, keys)
     found["shell_128px_few"] = Rendering("small", f"shell, {FEW_FRAMES} frames", of, few)
     return found
