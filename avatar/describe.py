@@ -24,6 +24,7 @@ from avatar.config import RenderConfig, TrainConfig
 from avatar.features import Condition
 from avatar.features.shared import code_count
 from avatar.field import ROWS, Field
+from avatar.layered.model import SAMPLES
 from avatar.settings import Settings, VariantConfig
 from fitting.head_model import HeadModel
 from workflow.settings import SettingsError, resolve_variants, validated
@@ -198,7 +199,9 @@ def describe(settings: dict[str, Any], head: HeadModel, name: str, warp_frames: 
         lines += ["", f"{block}: {parameters:,} parameters, {scaled(test)} a {chosen[0].unit}{extra}"]
         lines += [f"  {row.name:<28}{row.shape:<34}{row.parameters:>10,}  {note_of(row)}".rstrip() for row in chosen]
     if not hasattr(avatar, "field"):
-        return "\n".join([*lines, "", "a pixel: a texel of each layer until the light is gone"]) + "\n"
+        return (
+            "\n".join([*lines, "", f"each of a pixel's {SAMPLES} samples: a texel of each layer until the light is gone"]) + "\n"
+        )
     sample = sum(row.flop_test for row in rows if row.unit == "sample")
     vertex = 2 * avatar.field.from_feature.weight.numel() * head.vertex_count
     saved = sum(row.flop_test for row in rows if row.name == "from_feature")

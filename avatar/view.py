@@ -17,18 +17,19 @@ class View(NamedTuple):
     rotation: np.ndarray  # [3, 3] head frame to camera axes
     offset_m: np.ndarray  # [3] the head frame's origin in camera axes
     size: tuple[int, int]  # H, W
+    stride: int = 1  # how many widths of a pixel lie from one to the next: more than one where pixels are left out
 
     def every(self, stride: int) -> View:
         """The picture of every `stride`-th pixel, each seen along its own ray: rows and columns 0, stride, 2 stride..."""
         size = tuple(-(-side // stride) for side in self.size)
         # The centre of the new pixel i, i + 0.5, is that of the old one i * stride.
         centre = (np.asarray(self.centre_px, np.float64) - 0.5) / stride + 0.5
-        return View(self.focal_px / stride, centre, self.rotation, self.offset_m, size)
+        return View(self.focal_px / stride, centre, self.rotation, self.offset_m, size, self.stride * stride)
 
     def window(self, column: int, row: int, size: tuple[int, int]) -> View:
         """What it sees in a window of `size` (H, W) whose first pixel is (column, row)."""
         centre = np.asarray(self.centre_px, np.float64) - (column, row)
-        return View(self.focal_px, centre, self.rotation, self.offset_m, size)
+        return self._replace(centre_px=centre, size=size)
 
     def through(self, columns: np.ndarray, rows: np.ndarray) -> Rays:
         """Rays through the centres of pixels; columns, rows: [N] integers."""

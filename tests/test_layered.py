@@ -174,6 +174,18 @@ def test_a_file_draws_what_was_trained(head: HeadModel, scene: Scene) -> None:
         build.restore(stored | {"head_digest": "other"}, head)
 
 
+def test_left_out_pixels_are_not_seen_by_the_others(head: HeadModel, scene: Scene) -> None:
+    """The picture of every third pixel is every third pixel of the picture, two samples and all."""
+    avatar = made(head)
+    avatar.textures[...] += torch.randn(avatar.textures.shape)
+    posed, view = avatar.pose(*scene.heads([0], "cpu")), scene.view(0, (SIZE, SIZE))
+    assert view.every(2).every(3).stride == 6 == view.every(2).every(3).window(1, 1, (2, 2)).stride
+    whole, part = (avatar.picture(posed, seen, torch.float32)[0] for seen in (view, view.every(3)))
+    chosen = whole.colour.unflatten(0, (SIZE, SIZE))[::3, ::3].reshape(-1, 3)
+    assert chosen.shape == part.colour.shape and chosen.std() > 0.05
+    assert (chosen - part.colour).abs().amax(1).quantile(0.98) < 1e-3  # but where float32 moves an edge over a sample
+
+
 @pytest.mark.parametrize("factor", [0.0, 2.0, 1e3])
 def test_any_expression_gives_a_finite_picture(head: HeadModel, factor: float) -> None:
     track = toy_track(head, 2, SIZE)

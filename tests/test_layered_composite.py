@@ -42,17 +42,41 @@ def test_values_against_the_twin() -> None:
     assert evaluations == shown == int((fragments.inverse_depth > 0).sum())
 
 
-def test_gradients_against_the_twin() -> None:
+@pytest.mark.parametrize("samples", [1, 2])
+def test_gradients_against_the_twin(samples: int) -> None:
     textures, maps, fragments = scene(1)
-    weight = torch.from_numpy(np.random.default_rng(2).normal(size=(HEIGHT, WIDTH, 4)))
+    rows = HEIGHT // samples
+    fragments = Fragments(*(np.ascontiguousarray(part[:, : rows * samples]) for part in fragments))
+    weight = torch.from_numpy(np.random.default_rng(2).normal(size=(rows, WIDTH, 4)))
+
+    def pixels(drawn: tuple[Tensor, Tensor, int]) -> Tensor:
+        return composite.averaged(*drawn[:2], samples)[0]
+
     slow_textures, slow_maps = textures.double().requires_grad_(), maps.double().requires_grad_()
-    (exact(slow_textures, slow_maps, fragments)[0] * weight).sum().backward()
+    (pixels(exact(slow_textures, slow_maps, fragments)) * weight).sum().backward()
     gradient, touched = torch.zeros_like(textures), torch.zeros(textures.shape[:3], dtype=torch.uint8)
     fast = maps.clone().requires_grad_()
-    (composite.composite(textures, fast, fragments, gradient, touched)[0] * weight.float()).sum().backward()
+    (pixels(composite.composite(textures, fast, fragments, gradient, touched)) * weight.float()).sum().backward()
     torch.testing.assert_close(gradient.double(), slow_textures.grad, atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(fast.grad.double(), slow_maps.grad, atol=1e-4, rtol=1e-3)
     assert torch.equal(touched.bool(), touched.bool() | (gradient != 0).any(-1)) and touched.any() and not touched.all()
+
+
+def test_pixels_are_means_of_their_samples() -> None:
+    textures, maps, fragments = scene(5)
+    even = Fragments(*(np.ascontiguousarray(part[:, :6]) for part in fragments))
+    even.inverse_depth[:, :2, 0] = 0  # both samples of a pixel empty
+    even.inverse_depth[:, 2, 0] = 0  # and one of another
+    image, depth, _ = composite.composite(
+        textures, maps.requires_grad_(), even, torch.zeros_like(textures), torch.zeros(textures.shape[:3], dtype=torch.uint8)
+    )
+    pixels, along = composite.averaged(image, depth, 2)
+    assert pixels.shape == (3, WIDTH, 4) and along.shape == (3, WIDTH)
+    torch.testing.assert_close(pixels, (image[0::2] + image[1::2]) / 2)
+    assert along[0, 0] == 0 and torch.isclose(along[1, 0], depth[3, 0])  # nothing is no depth, and does not count as one
+    assert pixels.requires_grad and not along.requires_grad
+    same = composite.averaged(image, depth, 1)
+    assert same[0] is image and same[1] is depth
 
 
 def test_what_lies_behind_an_opaque_layer_is_not_asked_for() -> None:

@@ -57,7 +57,7 @@ def twin(textures: np.ndarray, maps: np.ndarray, fragments: Fragments) -> np.nda
 def test_equals_the_definition_within_half_a_level(bases: int, lead: int) -> None:
     textures, maps, fragments = case(bases, lead)
     wanted = twin(textures, maps, fragments) * 255
-    drawn = draw(quantised(textures, np.float32), maps, fragments)
+    drawn = draw(quantised(textures, np.float32), maps, fragments, samples=1)
     assert np.abs(drawn - wanted).max() < 0.5 + 0.2  # rounding, the last light that is not followed, and the fast sigmoid
     assert wanted.std() > 20
     empty = (fragments.inverse_depth == 0).all(0)
@@ -67,7 +67,7 @@ def test_equals_the_definition_within_half_a_level(bases: int, lead: int) -> Non
 def test_fewer_bits_cost_what_their_steps_are() -> None:
     textures, maps, fragments = case()
     wanted = twin(textures, maps, fragments) * 255
-    error = {kind: np.abs(draw(quantised(textures, kind), maps, fragments) - wanted) for kind in (np.int16, np.uint8)}
+    error = {kind: np.abs(draw(quantised(textures, kind), maps, fragments, samples=1) - wanted) for kind in (np.int16, np.uint8)}
     assert error[np.int16].max() < 0.7
     assert error[np.uint8].max() < 6 and error[np.uint8].mean() < 0.6
     levels, step, low = quantised(textures)
@@ -75,7 +75,7 @@ def test_fewer_bits_cost_what_their_steps_are() -> None:
     assert np.abs(again - textures).max() <= step.max() * 0.501
     stored = quantised(again)
     assert (stored.levels == levels).all()  # nothing is lost a second time
-    np.testing.assert_allclose(twin(again, maps, fragments) * 255, draw(stored, maps, fragments), atol=0.7)
+    np.testing.assert_allclose(twin(again, maps, fragments) * 255, draw(stored, maps, fragments, samples=1), atol=0.7)
 
 
 def test_every_logit_is_squashed_right() -> None:
@@ -87,47 +87,62 @@ def test_every_logit_is_squashed_right() -> None:
         for logit in logits[start : start + 401 : 8]:
             maps = np.full((1, 2, 2, 4), logit, np.float32)
             maps[..., 3] = 100  # opaque
-            pixel = draw(Textures(textures, np.ones((1, 4), np.float32), np.zeros((1, 4), np.float32)), maps, fragments)[0, 0]
+            plain = Textures(textures, np.ones((1, 4), np.float32), np.zeros((1, 4), np.float32))
+            pixel = draw(plain, maps, fragments, samples=1)[0, 0]
             assert pixel[3] == 255 and np.abs(pixel[:3] - 255 / (1 + np.exp(-float(logit)))).max() < 0.53
 
 
 def test_wild_maps_draw_something_finite_and_nothing_else_is_touched() -> None:
     textures, maps, fragments = case()
     maps[..., :2] *= 1e30  # fetches far outside: clamped to the edge
-    assert draw(quantised(textures), maps, fragments).shape == (HEIGHT, WIDTH, 4)
+    assert draw(quantised(textures), maps, fragments, samples=1).shape == (HEIGHT, WIDTH, 4)
     fragments.uv[:] = np.nan
-    draw(quantised(textures), maps, fragments)  # no pixel means anything, but no memory outside is read
+    draw(quantised(textures), maps, fragments, samples=1)  # no pixel means anything, but no memory outside is read
     for wrong in (np.nan, np.inf):
         maps[0, 0, 0, 4] = wrong
         with pytest.raises(ValueError, match="not finite"):
-            draw(quantised(textures), maps, fragments)
+            draw(quantised(textures), maps, fragments, samples=1)
 
 
 def test_threads_strides_and_buffers_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     textures, maps, fragments = case()
     stored = quantised(textures)
-    whole = draw(stored, maps, fragments)
+    whole = draw(stored, maps, fragments, samples=1)
     for count in (1, 2, 5):
         monkeypatch.setattr(threads, "count", lambda count=count: count)
-        assert (draw(stored, maps, fragments) == whole).all()
+        assert (draw(stored, maps, fragments, samples=1) == whole).all()
     strided = np.ascontiguousarray(maps.transpose(0, 3, 1, 2)).transpose(0, 2, 3, 1)
     buffer = np.full((HEIGHT, WIDTH, 4), 7, np.uint8)
-    assert draw(stored, strided, fragments, buffer) is buffer and (buffer == whole).all()
+    assert draw(stored, strided, fragments, buffer, samples=1) is buffer and (buffer == whole).all()
     nothing = Fragments(np.zeros((LAYERS, 0, 4), np.float32), np.zeros((LAYERS, 0, 4, 2), np.float32))
-    assert draw(stored, maps, nothing).shape == (0, 4, 4)
+    assert draw(stored, maps, nothing, samples=1).shape == (0, 4, 4)
+
+
+def test_a_pixel_is_the_mean_of_its_samples() -> None:
+    textures, maps, fragments = case()
+    stored, inner = quantised(textures), 32
+    depth, uv = fragments.inverse_depth[:, :inner], fragments.uv[:, :inner]
+    parts = [Fragments(np.ascontiguousarray(depth[:, s::2]), np.ascontiguousarray(uv[:, s::2])) for s in (0, 1)]
+    whole = draw(stored, maps, Fragments(np.ascontiguousarray(depth), np.ascontiguousarray(uv)), samples=2)
+    each = [draw(stored, maps, part, samples=1).astype(float) for part in parts]
+    assert whole.shape == (inner // 2, WIDTH, 4)
+    assert np.abs(whole - (each[0] + each[1]) / 2).max() <= 1 and np.abs(each[0] - each[1]).mean() > 20
 
 
 def test_what_does_not_fit_is_refused() -> None:
     textures, maps, fragments = case()
     stored = quantised(textures)
     with pytest.raises(ValueError, match="need maps"):
-        draw(stored, maps[..., :-1], fragments)
+        draw(stored, maps[..., :-1], fragments, samples=1)
     with pytest.raises(ValueError, match="need maps"):
-        draw(stored, maps[1:], fragments)
+        draw(stored, maps[1:], fragments, samples=1)
     with pytest.raises(ValueError, match="do not fit fragments"):
-        draw(stored, maps, Fragments(fragments.inverse_depth[1:], fragments.uv[1:]))
+        draw(stored, maps, Fragments(fragments.inverse_depth[1:], fragments.uv[1:]), samples=1)
+    for samples in (0, 2):
+        with pytest.raises(ValueError, match="33 rows of fragments"):
+            draw(stored, maps, fragments, samples=samples)
     with pytest.raises(ValueError, match="the picture is"):
-        draw(stored, maps, fragments, np.empty((HEIGHT, WIDTH, 3), np.uint8))
+        draw(stored, maps, fragments, np.empty((HEIGHT, WIDTH, 3), np.uint8), samples=1)
     with pytest.raises(ValueError, match="textures are"):
         quantised(textures[..., :5])
     textures[0, 0, 0, 0] = np.nan

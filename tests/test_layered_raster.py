@@ -75,24 +75,40 @@ def test_equals_rays_cast_at_every_triangle(stack: dict[str, np.ndarray]) -> Non
     assert (fragments.inverse_depth[2] > 0).sum() < 0.4 * (fragments.inverse_depth[1] > 0).sum()
 
 
-def test_tensor_path_covers_the_same_pixels(stack: dict[str, np.ndarray]) -> None:
+def test_two_samples_of_a_pixel_are_the_picture_moved_by_a_quarter_of_one(stack: dict[str, np.ndarray]) -> None:
+    both = rasterise(**stack, window=WINDOW, samples=2)
+    assert both.inverse_depth.shape == (3, 2 * HEIGHT, WIDTH)
+    for sample, move in ((0, 0.25), (1, -0.25)):
+        moved = stack["points"] + np.array([move, move, 0], np.float32)
+        alone = rasterise(**(stack | {"points": moved}), window=WINDOW)
+        depth, uv = both.inverse_depth[:, sample::2], both.uv[:, sample::2]
+        agree = (depth > 0) == (alone.inverse_depth > 0)
+        assert agree.mean() > 0.9999  # float32 moves an edge by a millionth of a pixel
+        seen = agree & (depth > 0)
+        np.testing.assert_allclose(depth[seen], alone.inverse_depth[seen], rtol=1e-4)
+        assert np.quantile(np.abs(uv[seen] - alone.uv[seen]), 0.999) < 1e-4
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_tensor_path_covers_the_same_pixels(stack: dict[str, np.ndarray], samples: int) -> None:
     window = (11, 7, 50, 40)
-    ours = rasterise(**stack, window=window)
-    theirs = rasterise_tensors(*(torch.from_numpy(stack[name]) for name in stack), window)
+    ours = rasterise(**stack, window=window, samples=samples)
+    theirs = rasterise_tensors(*(torch.from_numpy(stack[name]) for name in stack), window, samples)
     seen = ours.inverse_depth > 0
     assert (seen == (theirs.inverse_depth.numpy() > 0)).all() and seen.any()
     np.testing.assert_allclose(theirs.inverse_depth.numpy(), ours.inverse_depth, atol=1e-5)
     np.testing.assert_allclose(theirs.uv.numpy()[seen], ours.uv[seen], atol=1e-5)
 
 
+@pytest.mark.parametrize("samples", [1, 2])
 @pytest.mark.parametrize("tensors", [False, True])
-def test_neighbours_leave_no_crack_and_share_no_pixel(tensors: bool) -> None:
-    """A jittered flat grid whose corners often lie on pixel centres: one layer a triangle, each pixel in exactly one."""
+def test_neighbours_leave_no_crack_and_share_no_pixel(tensors: bool, samples: int) -> None:
+    """A jittered flat grid whose corners often lie on samples: one layer a triangle, each sample in exactly one."""
     random = np.random.default_rng(1)
     side = 7
     grid = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2) * 5.0
     inner = ((grid > 0) & (grid < 5 * (side - 1))).all(1)
-    grid[inner] += random.integers(-4, 5, (inner.sum(), 2)) / 2
+    grid[inner] += random.integers(-4 * samples, 4 * samples + 1, (inner.sum(), 2)) / (2 * samples)
     points = np.concatenate([grid, np.ones((len(grid), 1))], 1).astype(np.float32)
     a = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
     triangles = np.concatenate([np.stack([a, a + side, a + 1], 1), np.stack([a + 1, a + side, a + side + 1], 1)]).astype(np.int32)
@@ -100,9 +116,10 @@ def test_neighbours_leave_no_crack_and_share_no_pixel(tensors: bool) -> None:
     arguments = (np.repeat(points[None], count, 0), triangles, np.zeros((count, 3, 2), np.float32), np.eye(count, dtype=bool))
     window = (0, 0, 30, 30)
     if tensors:
-        hits = rasterise_tensors(*map(torch.from_numpy, arguments), window).inverse_depth.numpy() > 0
+        hits = rasterise_tensors(*map(torch.from_numpy, arguments), window, samples).inverse_depth.numpy() > 0
     else:
-        hits = rasterise(*arguments, window).inverse_depth > 0
+        hits = rasterise(*arguments, window, samples=samples).inverse_depth > 0
+    assert hits.shape[1:] == (30 * samples, 30)
     assert (hits.sum(0) == 1).all()
     assert not rasterise(arguments[0], triangles[:, ::-1], *arguments[2:], window).inverse_depth.any()  # seen from behind
 
@@ -165,6 +182,14 @@ def test_windows_threads_and_buffers_change_nothing(stack: dict[str, np.ndarray]
     np.testing.assert_allclose(wide.inverse_depth[:, 3:-3, 5:-5], whole.inverse_depth, rtol=1e-6)
     one = rasterise(**stack, window=WINDOW, shares=3)
     assert (one.inverse_depth == whole.inverse_depth).all()
+    two = [rasterise(**stack, window=WINDOW, shares=shares, samples=2).inverse_depth for shares in (1, 3)]
+    assert (two[0] == two[1]).all()
+    part, used = rasterise(**stack, window=(13, 21, 40, 30), samples=2), empty(3, 60, 40)  # an odd first row
+    used.inverse_depth.fill(1e9)
+    np.testing.assert_allclose(part.inverse_depth, two[0][:, 42:102, 13:53], rtol=1e-6)
+    assert (rasterise(**stack, window=(13, 21, 40, 30), out=used, samples=2).inverse_depth == part.inverse_depth).all()
+    wide = rasterise(**stack, window=(-5, -3, WIDTH + 10, HEIGHT + 6), samples=2)
+    np.testing.assert_allclose(wide.inverse_depth[:, 6:-6, 5:-5], two[0], rtol=1e-6)
     buffers = empty(3, HEIGHT, WIDTH)
     buffers.inverse_depth.fill(1e9)
     again = rasterise(**stack, window=WINDOW, out=buffers)
@@ -174,6 +199,10 @@ def test_windows_threads_and_buffers_change_nothing(stack: dict[str, np.ndarray]
 def test_what_does_not_fit_is_refused(stack: dict[str, np.ndarray]) -> None:
     with pytest.raises(ValueError, match="do not fit 3 layers of 72x80"):
         rasterise(**stack, window=WINDOW, out=empty(2, HEIGHT, WIDTH))
+    with pytest.raises(ValueError, match="do not fit 3 layers of 144x80"):
+        rasterise(**stack, window=WINDOW, out=empty(3, HEIGHT, WIDTH), samples=2)
+    with pytest.raises(ValueError, match="one or two samples, not 3"):
+        rasterise(**stack, window=WINDOW, samples=3)
     with pytest.raises(ValueError, match="points are"):
         rasterise(**(stack | {"points": stack["points"][..., :2]}), window=WINDOW)
     with pytest.raises(ValueError, match="need flags"):

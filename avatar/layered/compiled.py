@@ -3,10 +3,10 @@
 LLVM does not vectorise such short loops over channels by itself, so a texel is a vector type of its own here, `Lanes`, with
 the few operations that are needed, each in LLVM's portable vector instructions. A row is drawn block by block in four stages
 (order, coarse map, texture, compositing) without jumps that depend on what was fetched: one stage's latencies overlap.
-nerface.mp4, one thread, 8-bit textures, ms a frame: plain numba 57, with vectors 28, in stages 19; on a computer whose other
-cores are busy 30 in stages, 19.5 with cache lines asked for ahead.
+nerface.mp4, one thread, 8-bit textures, one sample a pixel, ms a frame: plain numba 57, with vectors 28, in stages 19; on a
+computer whose other cores are busy 30 in stages, 19.5 with cache lines asked for ahead.
 
-Letters: L layers, R texels a side of a texture, r of a frame's map, K bases, h x w pixels. All arrays are flat.
+Letters: L layers, R texels a side of a texture, r of a frame's map, K bases, h x w pixels of S samples. All arrays are flat.
 All of it is one file because numba's cache of compiled code only notices changes of the caller's file.
 """
 
@@ -55,58 +55,62 @@ def compiled(bases: int, lead: int) -> Callable[..., None]:
     channels, fields = 4 * (1 + bases), padded_fields(bases, lead)
 
     @njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
-    def run(texture, step, low, maps, depth, uv, out, side, coarse, height, width, layers, share, shares):  # noqa: ANN001, ANN202
-        plane, most = height * width, BLOCK * ROUND
+    def run(texture, step, low, maps, depth, uv, out, side, coarse, height, width, samples, layers, share, shares):  # noqa: ANN001, ANN202
+        plane, most, part = samples * height * width, BLOCK * ROUND, ONE / np.float32(samples)
         keys, order, counts = np.empty(layers, np.float32), np.empty(BLOCK * layers, np.int32), np.empty(BLOCK, np.int32)
-        light, colour = np.empty(BLOCK, np.float32), np.empty(4 * BLOCK, np.float32)
+        light, colour, mean = np.empty(BLOCK, np.float32), np.empty(4 * BLOCK, np.float32), np.empty(4 * BLOCK, np.float32)
         pixel, layer, place = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32)  # of each item
         texel, within, lanes = np.empty(most, np.int64), np.empty(2 * most, np.float32), np.empty(most * fields, np.float32)
         for row in range(share, height, shares):  # every thread gets its share of the head
             for begin in range(0, width, BLOCK):
-                first, number = row * width + begin, min(BLOCK, width - begin)
-                for p in range(number):  # a pixel's layers, nearest first
-                    counts[p] = _sort(depth, first + p, plane, layers, order, p * layers, keys)
-                    light[p] = ONE
-                    _store(colour, 4 * p, _nothing(4))
-                for start in range(0, layers, ROUND):
-                    items = 0
+                number = min(BLOCK, width - begin)
+                mean[:] = 0
+                for sample in range(samples):
+                    first = (samples * row + sample) * width + begin
+                    for p in range(number):  # a pixel's layers, nearest first
+                        counts[p] = _sort(depth, first + p, plane, layers, order, p * layers, keys)
+                        light[p] = ONE
+                        _store(colour, 4 * p, _nothing(4))
+                    for start in range(0, layers, ROUND):
+                        items = 0
+                        for p in range(number):
+                            if light[p] >= DARK:
+                                for rank in range(start, min(start + ROUND, counts[p])):
+                                    pixel[items], layer[items] = p, order[p * layers + rank]
+                                    place[items] = layer[items] * plane + first + p
+                                    _prefetch(uv, 2 * place[items])
+                                    items += 1
+                        for i in range(items):  # the coarse map, and where to read the texture
+                            u, v = uv[2 * place[i]], uv[2 * place[i] + 1]
+                            column, line, x, y = _place(u, v, coarse)
+                            corner = ((layer[i] * coarse + line) * coarse + column) * fields
+                            mix = _bilinear(maps, corner, coarse * fields, x, y, fields)
+                            if lead:
+                                u, v = u + _lane(mix, 0), v + _lane(mix, 1)
+                            column, line, x, y = _place(u, v, side)
+                            texel[i] = ((layer[i] * side + line) * side + column) * channels
+                            for ahead in (0, 2 * channels - 1):  # both ends: a pair of texels may lie in two cache lines
+                                _prefetch(texture, texel[i] + ahead)
+                                _prefetch(texture, texel[i] + side * channels + ahead)
+                            within[2 * i], within[2 * i + 1] = x, y
+                            _store(lanes, i * fields, mix)
+                        for i in range(items):  # colour and opacity
+                            fetched = _bilinear(texture, texel[i], side * channels, within[2 * i], within[2 * i + 1], channels)
+                            unit, zero = _load(step, layer[i] * channels, channels), _load(low, layer[i] * channels, channels)
+                            mix = _load(lanes, i * fields, fields)
+                            _store(lanes, i * fields, _shown(fetched, unit, zero, mix, bases, lead))
+                        for i in range(items):
+                            p, shown = pixel[i], _load(lanes, i * fields, 4)
+                            weight = light[p] * _lane(shown, 3)
+                            _store(colour, 4 * p, _add_scaled(_load(colour, 4 * p, 4), shown, weight))
+                            light[p] -= weight
                     for p in range(number):
-                        if light[p] >= DARK:
-                            for rank in range(start, min(start + ROUND, counts[p])):
-                                pixel[items], layer[items] = p, order[p * layers + rank]
-                                place[items] = layer[items] * plane + first + p
-                                _prefetch(uv, 2 * place[items])
-                                items += 1
-                    for i in range(items):  # the coarse map, and where to read the texture
-                        u, v = uv[2 * place[i]], uv[2 * place[i] + 1]
-                        column, line, x, y = _place(u, v, coarse)
-                        corner = ((layer[i] * coarse + line) * coarse + column) * fields
-                        mix = _bilinear(maps, corner, coarse * fields, x, y, fields)
-                        if lead:
-                            u, v = u + _lane(mix, 0), v + _lane(mix, 1)
-                        column, line, x, y = _place(u, v, side)
-                        texel[i] = ((layer[i] * side + line) * side + column) * channels
-                        for ahead in (0, 2 * channels - 1):  # both ends: a pair of texels may lie in two cache lines
-                            _prefetch(texture, texel[i] + ahead)
-                            _prefetch(texture, texel[i] + side * channels + ahead)
-                        within[2 * i], within[2 * i + 1] = x, y
-                        _store(lanes, i * fields, mix)
-                    for i in range(items):  # colour and opacity
-                        fetched = _bilinear(texture, texel[i], side * channels, within[2 * i], within[2 * i + 1], channels)
-                        unit, zero = _load(step, layer[i] * channels, channels), _load(low, layer[i] * channels, channels)
-                        mix = _load(lanes, i * fields, fields)
-                        _store(lanes, i * fields, _shown(fetched, unit, zero, mix, bases, lead))
-                    for i in range(items):
-                        p, shown = pixel[i], _load(lanes, i * fields, 4)
-                        weight = light[p] * _lane(shown, 3)
-                        _store(colour, 4 * p, _add_scaled(_load(colour, 4 * p, 4), shown, weight))
-                        light[p] -= weight
-                for p in range(number):
-                    at, rest = 4 * (first + p), light[p]
-                    out[at] = np.uint8((colour[4 * p] + rest) * FULL + HALF)
-                    out[at + 1] = np.uint8((colour[4 * p + 1] + rest) * FULL + HALF)
-                    out[at + 2] = np.uint8((colour[4 * p + 2] + rest) * FULL + HALF)
-                    out[at + 3] = np.uint8((ONE - rest) * FULL + HALF)
+                        for channel in range(3):
+                            mean[4 * p + channel] += part * (colour[4 * p + channel] + light[p])
+                        mean[4 * p + 3] += part * (ONE - light[p])
+                at = 4 * (row * width + begin)
+                for i in range(4 * number):
+                    out[at + i] = np.uint8(mean[i] * FULL + HALF)
 
     return run
 

@@ -6,7 +6,7 @@ A frame's map, low in resolution, holds D = 2 + 4 + K: by how much the fetch mov
     value = texture(uv + move)[static] + direct + sum_k weight_k texture(uv + move)[basis k], colour, opacity = sigmoid(value)
 
 On the CPU by the compiled `training_pass`, threaded; `reference` is the same in plain PyTorch for any device, the tests' twin.
-Letters: L layers, R texels a side of a texture, r of a frame's map, h x w pixels.
+Letters: L layers, R texels a side of a texture, r of a frame's map, h x w pixels, or their samples (see `averaged`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from avatar.layered.raster import Fragments
 
 MOVE, DIRECT = training_pass.LEAD, 4  # channels of a frame's map before the K weights
 MOST_LAYERS = 16
+LEAST = 1e-9  # opacity: less than any that a sample has
 
 
 def map_channels(bases: int) -> int:
@@ -138,6 +139,18 @@ def composite(
     if gradient is None:
         return _drawn(textures.detach(), _padded(maps), *fragments, np.empty(0, np.float32))[:3]
     return _Composite.apply(maps, textures.detach(), gradient, touched, *fragments)
+
+
+def averaged(image: Tensor, depth: Tensor, samples: int) -> tuple[Tensor, Tensor]:
+    """Pixels from S samples each: image [S h, w, 4] and depth [S h, w] of `composite` become [h, w, 4] and [h, w].
+
+    The mean of the samples' light; of their depths weighted by opacity, 0 where there is none.
+    """
+    if samples == 1:
+        return image, depth
+    image, depth = image.unflatten(0, (-1, samples)), depth.unflatten(0, (-1, samples))
+    opacity = image[..., 3].detach()
+    return image.mean(1), (depth * opacity).sum(1) / opacity.sum(1).clamp_min(LEAST)
 
 
 def reference(textures: Tensor, maps: Tensor, fragments: Fragments) -> tuple[Tensor, Tensor, int]:

@@ -46,7 +46,9 @@ def quantised(textures: np.ndarray, kind: type = np.uint8) -> Textures:
     return Textures(levels, step, low)
 
 
-def draw(textures: Textures, maps: np.ndarray, fragments: Fragments, out: np.ndarray | None = None) -> np.ndarray:
+def draw(
+    textures: Textures, maps: np.ndarray, fragments: Fragments, out: np.ndarray | None = None, *, samples: int
+) -> np.ndarray:
     """Composite the layers front to back, by each pixel's own order of depth, on white.
 
     Args:
@@ -55,6 +57,7 @@ def draw(textures: Textures, maps: np.ndarray, fragments: Fragments, out: np.nda
             the weight of each basis (K); any strides.
         fragments: of the same L layers in a window of h x w pixels.
         out: [h, w, 4] uint8 to overwrite.
+        samples: of a pixel in the fragments; a pixel is their mean.
 
     Returns:
         [h, w, 4] uint8: red, green, blue on white, and opacity.
@@ -62,15 +65,18 @@ def draw(textures: Textures, maps: np.ndarray, fragments: Fragments, out: np.nda
     Raises:
         ValueError: shapes do not fit each other, or the maps are not finite.
     """
-    layers, height, width = fragments.inverse_depth.shape
+    layers, rows, width = fragments.inverse_depth.shape
     channels, side, coarse = textures.levels.shape[3], textures.levels.shape[1], maps.shape[1]
     bases, lead = channels // 4 - 1, maps.shape[-1] - 4 - (channels // 4 - 1)
     if textures.levels.shape[:3] != (layers, side, side) or textures.step.shape != (layers, channels):
         raise ValueError(f"textures {textures.levels.shape} do not fit fragments of {layers} layers")
+    if samples < 1 or rows % samples:
+        raise ValueError(f"{rows} rows of fragments are not those of pixels with {samples} samples each")
     if maps.shape[:3] != (layers, coarse, coarse) or lead not in (0, 2) or coarse < 2:
         raise ValueError(
             f"{layers} layers with {bases} bases need maps [L, r, r, {4 + bases} or {6 + bases}], found {maps.shape}"
         )
+    height = rows // samples
     out = np.empty((height, width, 4), np.uint8) if out is None else out
     if out.shape != (height, width, 4) or out.dtype != np.uint8 or not out.flags.c_contiguous:
         raise ValueError(f"the picture is [{height}, {width}, 4] uint8, found {out.shape} {out.dtype}")
@@ -79,5 +85,5 @@ def draw(textures: Textures, maps: np.ndarray, fragments: Fragments, out: np.nda
         raise ValueError("the maps of this frame are not finite; train the avatar again")
     flat = [array.reshape(-1) for array in (*textures, padded, *fragments, out)]
     run, shares = compiled(bases, lead), threads.count()
-    threads.run(lambda share: run(*flat, side, coarse, height, width, layers, share, shares), shares)
+    threads.run(lambda share: run(*flat, side, coarse, height, width, samples, layers, share, shares), shares)
     return out

@@ -32,6 +32,7 @@ MOVES_M = 0.003  # expressions move the skin by millimetres: inputs of about one
 WIDTH = 64  # channels of the U-Net's output
 START = 0.02  # standard deviation of the output layer's weights: at the start the static texture is all there is
 LEARNED = ("unet.", "out.", "fading")  # entries of the state that a file holds as the networks'
+SAMPLES = 2  # of a pixel, in training too: with one, rims of shells and what is seen edge on are ragged
 BASIS_START = 0.01  # of the bases: a basis of zeros would never get a gradient, nor its weight
 
 
@@ -118,7 +119,7 @@ class LayeredAvatar(nn.Module):
         self.offsets_m = stored["offsets_m"].to(self.offsets_m)
 
     def sharpen(self, factor: float) -> None:
-        """Nothing: there are no samples to multiply."""
+        """Nothing: there are no samples along a ray to multiply."""
 
     def pose(self, vertices_m: Tensor, condition: Condition) -> Posed:
         """The layers of one posed head, vertices [1, V, 3]."""
@@ -153,20 +154,25 @@ class LayeredAvatar(nn.Module):
         fade = torch.cat([fade, fade.new_zeros(self.count - len(fade), *fade.shape[1:])])[..., None]
         return torch.cat([LARGEST_MOVE * torch.tanh(move), colour, opacity - fade, weights], -1)
 
-    def fragments(self, posed: Posed, view: View) -> Fragments:
-        """What each layer shows to each pixel."""
-        points = view.pixels_of(posed.layers_m).astype(np.float32)
-        return raster.rasterise(points, self.triangles, self.corner_uv, self.drawn, (0, 0, view.size[1], view.size[0]))
+    def fragments(self, posed: Posed, view: View, samples: int = 1) -> Fragments:
+        """What each layer shows to each sample of each pixel; see `avatar.layered.raster.rasterise`."""
+        if samples == 1 or view.stride == 1:
+            points, window = view.pixels_of(posed.layers_m).astype(np.float32), (0, 0, view.size[1], view.size[0])
+            return raster.rasterise(points, self.triangles, self.corner_uv, self.drawn, window, samples=samples)
+        moves = np.array([0.25, -0.25]) / view.stride  # where pixels are left out, both samples lie close to its centre
+        each = [self.fragments(posed, view._replace(centre_px=view.centre_px + move)) for move in moves]
+        return Fragments(*(np.stack(parts, 2).reshape(self.count, -1, *parts[0].shape[2:]) for parts in zip(*each, strict=True)))
 
     @torch.no_grad()
     def picture(self, posed: Posed, view: View, precision: torch.dtype) -> tuple[Rendered, int]:
         """All pixels of a view, row by row, and how many texels were asked for."""
-        maps, fragments = self.maps(posed, view), self.fragments(posed, view)
+        maps, fragments = self.maps(posed, view), self.fragments(posed, view, SAMPLES)
         if maps.device.type == "cpu":
             image, depth, count = composite.composite(self.textures, maps, fragments)
         else:
             there = Fragments(*(torch.from_numpy(part).to(maps.device) for part in fragments))
             image, depth, count = composite.reference(self.textures, maps, there)
+        image, depth = composite.averaged(image, depth, SAMPLES)
         rows, columns = np.mgrid[: view.size[0], : view.size[1]] + 0.5
         slant = np.sqrt(1 + ((np.stack([columns, rows], -1) - view.centre_px) ** 2).sum(-1) / view.focal_px**2)
         along = depth.cpu() * torch.from_numpy(slant.astype(np.float32))

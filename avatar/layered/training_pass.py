@@ -4,10 +4,10 @@ As `avatar.layered.compiled`, whose vector types it uses: a texel is one vector,
 that one pixel waits for its texels while others are computed with. But nothing is approximate here: the sigmoid is right to
 float32, a layer is fetched only where light is left, and what is not a number stays so (a step with such a loss is not taken).
 
-nerface.mp4, 256 x 256 pixels, 8 layers of 512 x 512 texels, one thread, ms against loops in plain numba: forward 16 (42),
+nerface.mp4, 256 x 256 samples, 8 layers of 512 x 512 texels, one thread, ms against loops in plain numba: forward 16 (42),
 backward 19 (38; without asking for texels ahead 28). Not faster: blocks of 32 or 128, and pages of 2 MiB for the textures
 (24 and 32: lines of a power of two fall on the same places of the cache).
-Letters: L layers, R texels a side of a texture, r of a frame's map, K bases, C = 4 (1 + K), h x w pixels. All arrays are flat.
+Letters: L layers, R texels a side of a texture, r of a frame's map, K bases, C = 4 (1 + K), h x w samples. All arrays are flat.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from torch import Tensor
 from avatar import build, lpips
 from avatar.dataset import on_white
 from avatar.layered import composite, initial
+from avatar.layered.model import SAMPLES
 from avatar.layered.perceptual import Perceptual
 from avatar.layered.texel_adam import BETAS, TexelAdam
 from avatar.learning import Data, Loss, measured_shell
@@ -133,8 +134,9 @@ class ImageLearner:
         view = self.optimiser.alignment.applied(self.data.scene.place[frame], view, middle)
         view, place = self.window(frame, posed, view, random)
         texels, maps = self.optimiser.texels, self.avatar.maps(posed, view, self.stirred(posed, view, random))
-        fragments = self.avatar.fragments(posed, view)
+        fragments = self.avatar.fragments(posed, view, SAMPLES)
         image, depth, count = composite.composite(self.avatar.textures, maps, fragments, texels.gradient, texels.touched)
+        image, depth = composite.averaged(image, depth, SAMPLES)
         matte = torch.from_numpy(self.data.alpha[frame][place] / np.float32(255))
         truth = torch.from_numpy(on_white(self.data.frames[frame][place], self.data.alpha[frame][place]))
         if number >= ALIGNED_FROM * self.config.steps:
