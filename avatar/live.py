@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from avatar.features import Condition
-from avatar.layered.model import LayeredAvatar
+from avatar.layered.model import SAMPLES, LayeredAvatar
 from avatar.layered.posing import PosedHead, Poser
 from avatar.layered.runtime import Runtime
 from avatar.networks import best_precision
@@ -33,15 +33,18 @@ class Live:
         camera: Camera,
         precision: torch.dtype | None = None,
         device: str = "cpu",
+        samples: int = SAMPLES,
     ) -> None:
-        """shape: [S] of the identity; precision: of the networks, None takes the device's best."""
+        """shape: [S] of the identity; precision: of the networks, None takes the device's best; samples: 1 or 2 of a pixel that
+        the compiled pass draws.
+        """
         self._avatar, self._camera, self._device = avatar, camera, device
         self._precision = best_precision(device) if precision is None else precision
         self._poser = Poser(head, shape)
         self._neutral = torch.from_numpy(self._poser.neutral_m).to(device)
         self._runtime = None
         if isinstance(avatar, LayeredAvatar) and torch.device(device).type == "cpu":
-            self._runtime = Runtime(avatar, self._poser.neutral_m, camera, self._precision)
+            self._runtime = Runtime(avatar, self._poser.neutral_m, camera, self._precision, samples)
         self.milliseconds: dict[str, float] = {}
         """Of the last frame: its stages (pose, networks, raster, draw; only pose and draw of an avatar that is not layered), and
         all of it (frame), less than the sum where stages ran beside each other."""

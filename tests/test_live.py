@@ -137,6 +137,12 @@ def test_a_layered_avatar_is_drawn_as_its_own_picture(head, avatar, track) -> No
     assert 0 < np.abs(lower.astype(int) - first).mean() < 3
 
 
+def test_one_sample_a_pixel_is_nearly_the_same_picture(head, avatar, track) -> None:  # noqa: ANN001
+    given = avatar, head, track["shape"], camera_of(track), torch.float32
+    one, two = (Live(*given, samples=samples).frame(row_of(track, 1)).astype(float) for samples in (1, 2))
+    assert 0 < np.abs(one - two).mean() < 0.25 * np.abs(two - 255).mean()  # of textures of noise
+
+
 def test_threads_do_not_change_the_picture_nor_torch(head, avatar, track, monkeypatch) -> None:  # noqa: ANN001
     torches = torch.get_num_threads()
     live, images = Live(avatar, head, track["shape"], camera_of(track), torch.float32), []

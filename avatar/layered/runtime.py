@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from avatar.features import Condition
 from avatar.layered import posing, threads
 from avatar.layered.draw import draw, quantised
-from avatar.layered.model import SAMPLES, LayeredAvatar, Posed
+from avatar.layered.model import LayeredAvatar, Posed
 from avatar.layered.posing import PosedHead
 from avatar.layered.raster import Fragments, rasterise
 from avatar.uses.sequence import Camera
@@ -36,8 +36,11 @@ class Lowered(nn.Module):
 class Runtime:
     """One layered avatar before one camera."""
 
-    def __init__(self, avatar: LayeredAvatar, neutral_m: np.ndarray, camera: Camera, precision: torch.dtype) -> None:
-        """neutral_m: [V, 3] of the subject; precision: of the convolutions."""
+    def __init__(
+        self, avatar: LayeredAvatar, neutral_m: np.ndarray, camera: Camera, precision: torch.dtype, samples: int
+    ) -> None:
+        """neutral_m: [V, 3] of the subject; precision: of the convolutions; samples: of a pixel, 1 or 2."""
+        self._samples = samples
         self._avatar = copy.copy(avatar)
         self._avatar._modules = avatar._modules | {"unet": Lowered(avatar.unet, precision)}
         self._textures = quantised(avatar.textures.cpu().numpy())
@@ -61,13 +64,13 @@ class Runtime:
         waiting = self._beside.submit(self._maps, Posed(places, normals, condition), view) if together else None
         started = time.perf_counter()
         window = _window(box, self._size)
-        fragments = self._fragments(points, window, threads.count())
+        fragments = self._fragments(points, window, max(1, threads.count() - 1))
         self.milliseconds["raster"] = 1e3 * (time.perf_counter() - started)
         maps = waiting.result() if waiting else self._maps(Posed(places, normals, condition), view)
         started = time.perf_counter()
         left, top, width, height = window
         picture = np.full((*self._size, 3), 255, np.uint8)
-        drawn = draw(self._textures, maps, fragments, self._buffer("drawn", (height, width, 4), np.uint8), samples=SAMPLES)
+        drawn = draw(self._textures, maps, fragments, self._buffer("drawn", (height, width, 4), np.uint8), samples=self._samples)
         picture[top : top + height, left : left + width] = drawn[..., :3]
         self.milliseconds["draw"] = 1e3 * (time.perf_counter() - started)
         return picture
@@ -87,10 +90,10 @@ class Runtime:
         return maps
 
     def _fragments(self, points: np.ndarray, window: tuple[int, int, int, int], shares: int) -> Fragments:
-        shape = len(points), SAMPLES * window[3], window[2]
+        shape = len(points), self._samples * window[3], window[2]
         out = Fragments(self._buffer("depth", shape), self._buffer("uv", (*shape, 2)))
         avatar = self._avatar
-        return rasterise(points, avatar.triangles, avatar.corner_uv, avatar.drawn, window, out, shares, SAMPLES)
+        return rasterise(points, avatar.triangles, avatar.corner_uv, avatar.drawn, window, out, shares, self._samples)
 
     def _buffer(self, name: str, shape: tuple[int, ...], kind: type = np.float32) -> np.ndarray:
         """Memory of the last frames, as an array of a shape: fresh pages cost more than what is written to them."""

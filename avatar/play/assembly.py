@@ -26,6 +26,8 @@ from workflow import step
 
 SIZES = (64, 96, 128, 160, 192, 256, 384, 512, 768, 1024)
 """Pixels on the longer side that the page offers, as far as the frames go."""
+LIVE_SAMPLES = 1
+"""Of a pixel of a layered avatar; two are for pictures that are kept (nerface.mp4, 512 px, 2 threads: 34 ms a frame, two 50)."""
 
 
 def server_of(folder: Path, config: PlayConfig) -> tuple[Server, Callable[[], None]]:
@@ -49,7 +51,7 @@ def server_of(folder: Path, config: PlayConfig) -> tuple[Server, Callable[[], No
     def new_drawer(size: int) -> drawing.Drawer:
         # Called by the thread that draws: numba keeps the number of threads for each thread apart.
         numba.set_num_threads(min(config.threads, numba.config.NUMBA_NUM_THREADS))
-        return Live(room.avatar, head, shape, room.camera.resized(size), room.precision, room.device)
+        return Live(room.avatar, head, shape, room.camera.resized(size), room.precision, room.device, LIVE_SAMPLES)
 
     size = min(config.size or drawing.first_size(opened.representation), max(room.camera.size))
     filmed = ("video", "camera") if config.video else ("camera",)
