@@ -27,7 +27,7 @@ from workflow import step
 SIZES = (64, 96, 128, 160, 192, 256, 384, 512, 768, 1024)
 """Pixels on the longer side that the page offers, as far as the frames go."""
 LIVE_SAMPLES = 1
-"""Of a pixel of a layered avatar; two are for pictures that are kept (nerface.mp4, 512 px, 2 threads: 34 ms a frame, two 50)."""
+"""Of a pixel of a layered avatar; two are for pictures that are kept (nerface.mp4, 512 px, 2 threads: 36 ms a frame, two 50)."""
 
 
 def server_of(folder: Path, config: PlayConfig) -> tuple[Server, Callable[[], None]]:
